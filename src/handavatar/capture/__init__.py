@@ -1,0 +1,1 @@
+"""Frames of a hand with a known pose: read, written, made from a video or rendered."""

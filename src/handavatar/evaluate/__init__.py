@@ -1,0 +1,1 @@
+"""Metrics and protocols that judge an avatar, and the report that shows them."""

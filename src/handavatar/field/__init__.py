@@ -1,0 +1,1 @@
+"""Learned functions of a point near the hand: occupancy, albedo, illumination, shape."""

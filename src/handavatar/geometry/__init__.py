@@ -1,0 +1,1 @@
+"""Pure functions of tensors; knows nothing of hands or of learning."""

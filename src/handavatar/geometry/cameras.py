@@ -1,0 +1,121 @@
+"""Pinhole cameras in OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera without distortion.
+
+    Attributes:
+        focal: focal lengths (x, y), pixels.
+        center: principal point (x, y), pixels; the centre of the first pixel is (0.5, 0.5).
+        width: image width, pixels.
+        height: image height, pixels.
+        camera_from_world: rigid transform, metres, OpenCV camera axes.
+    """
+
+    focal: tuple[float, float]
+    center: tuple[float, float]
+    width: int
+    height: int
+    camera_from_world: Float[Tensor, "4 4"]
+
+    def to(self, device: torch.device | str) -> "Camera":
+        """The same camera with its transform on another device."""
+        return replace(self, camera_from_world=self.camera_from_world.to(device))
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same view with another number of pixels."""
+        x, y = width / self.width, height / self.height
+        return replace(
+            self,
+            focal=(self.focal[0] * x, self.focal[1] * y),
+            center=(self.center[0] * x, self.center[1] * y),
+            width=width,
+            height=height,
+        )
+
+    def cropped(self, left: float, top: float, width: float, height: float) -> "Camera":
+        """The view through a window of the image; the window may leave the image.
+
+        Args:
+            left: left border of the window, pixels of this camera.
+            top: top border.
+            width: width of the window; rounded to whole pixels of the new image.
+            height: height of the window.
+        """
+        return replace(
+            self,
+            center=(self.center[0] - left, self.center[1] - top),
+            width=round(width),
+            height=round(height),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """Half lines in world space.
+
+    Attributes:
+        origins: metres.
+        directions: unit length.
+    """
+
+    origins: Float[Tensor, "rays 3"]
+    directions: Float[Tensor, "rays 3"]
+
+
+def pixel_centers(camera: Camera) -> Float[Tensor, "height width 2"]:
+    """Centres (x, y) of all pixels, at +0.5."""
+    device = camera.camera_from_world.device
+    y, x = torch.meshgrid(
+        torch.arange(camera.height, device=device),
+        torch.arange(camera.width, device=device),
+        indexing="ij",
+    )
+    return torch.stack([x, y], dim=-1).to(camera.camera_from_world.dtype) + 0.5
+
+
+def rays_through_pixels(camera: Camera, pixels: Float[Tensor, "rays 2"]) -> Rays:
+    """World-space rays from the camera centre through image points (x, y) in pixels."""
+    focal = pixels.new_tensor(camera.focal)
+    center = pixels.new_tensor(camera.center)
+    in_camera = torch.cat([(pixels - center) / focal, torch.ones_like(pixels[:, :1])], dim=-1)
+    rotation = camera.camera_from_world[:3, :3]
+    directions = torch.nn.functional.normalize(in_camera @ rotation, dim=-1)
+    origin = -(camera.camera_from_world[:3, 3] @ rotation)
+    return Rays(origin.expand_as(directions), directions)
+
+
+def project(
+    camera: Camera, points: Float[Tensor, "*batch 3"]
+) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch"]]:
+    """Image positions in pixels, and depths along the optical axis in metres.
+
+    Points at or behind the camera plane give positions that mean nothing; check the depth.
+    """
+    rotation, translation = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
+    in_camera = points @ rotation.T + translation
+    depth = in_camera[..., 2]
+    safe = torch.where(depth.abs() < 1e-9, torch.full_like(depth, 1e-9), depth)
+    pixels = in_camera[..., :2] / safe[..., None] * points.new_tensor(camera.focal)
+    return pixels + points.new_tensor(camera.center), depth
+
+
+def look_at(
+    eye: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]
+) -> Float[Tensor, "4 4"]:
+    """``camera_from_world`` of a camera at ``eye`` that looks at ``target``, ``up`` upwards."""
+    forward = torch.nn.functional.normalize(target - eye, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+    down = torch.linalg.cross(forward, right)
+    rotation = torch.stack([right, down, forward])
+    transform = torch.eye(4, dtype=eye.dtype, device=eye.device)
+    transform[:3, :3] = rotation
+    transform[:3, 3] = -rotation @ eye
+    return transform

@@ -1,0 +1,103 @@
+"""Hand poses: the bone tree, joint rotations and the placement of the wrist."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from handavatar.geometry.rotations import matrix_from_axis_angle, rigid_transform
+
+BONE_NAMES: tuple[str, ...] = (
+    "wrist",
+    "index1",
+    "index2",
+    "index3",
+    "middle1",
+    "middle2",
+    "middle3",
+    "little1",
+    "little2",
+    "little3",
+    "ring1",
+    "ring2",
+    "ring3",
+    "thumb1",
+    "thumb2",
+    "thumb3",
+)
+BONE_PARENTS: tuple[int, ...] = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)
+NUM_BONES = len(BONE_NAMES)
+FINGER_BONES: dict[str, tuple[int, ...]] = {
+    finger: tuple(i for i, name in enumerate(BONE_NAMES) if name.startswith(finger))
+    for finger in ("thumb", "index", "middle", "ring", "little")
+}
+CONNECTED_PAIRS: tuple[tuple[int, int], ...] = tuple(
+    (parent, bone) for bone, parent in enumerate(BONE_PARENTS) if parent >= 0
+)
+
+
+@dataclass(frozen=True, eq=False)
+class HandPose:
+    """Joint rotations and wrist placement of one hand, or of a batch of hands.
+
+    Attributes:
+        rotations: axis-angle in radians per bone in the order of ``BONE_NAMES``, relative to the
+            parent bone; the wrist's is relative to the world. Zero is the flat hand.
+        translation: metres; the posed wrist joint lies at the rest wrist joint plus this.
+    """
+
+    rotations: Float[Tensor, "*batch bones 3"]
+    translation: Float[Tensor, "*batch 3"]
+
+    @staticmethod
+    def flat(device: torch.device | str = "cpu") -> "HandPose":
+        """The zero pose at the origin."""
+        return HandPose(torch.zeros(NUM_BONES, 3, device=device), torch.zeros(3, device=device))
+
+    def to(self, device: torch.device | str) -> "HandPose":
+        """The same pose on another device."""
+        return replace(
+            self, rotations=self.rotations.to(device), translation=self.translation.to(device)
+        )
+
+
+def bone_transforms(
+    rotations: Float[Tensor, "*batch bones 3"], rest_joints: Float[Tensor, "*shape bones 3"]
+) -> Float[Tensor, "*batch bones 4 4"]:
+    """``world_from_bone`` G_b of every bone: its joint as origin, rest axes turned by the pose.
+
+    Args:
+        rotations: axis-angle, radians, relative to the parent bone.
+        rest_joints: joint positions in the zero pose, metres.
+
+    Source: paper appendix A, the bone-transform equation.
+    Departs: the printed chain multiplies absolute joint positions; only offsets from the parent
+        joint compose, as in MANO.
+    """
+    local_rotations = matrix_from_axis_angle(rotations)
+    joints = rest_joints.expand(*rotations.shape[:-2], -1, -1)
+    chain: list[Tensor] = []
+    for bone, parent in enumerate(BONE_PARENTS):
+        offset = joints[..., bone, :] - (joints[..., parent, :] if parent >= 0 else 0)
+        parent_from_bone = rigid_transform(local_rotations[..., bone, :, :], offset)
+        chain.append(parent_from_bone if parent < 0 else chain[parent] @ parent_from_bone)
+    return torch.stack(chain, dim=-3)
+
+
+def linear_blend_skinning(
+    rest_vertices: Float[Tensor, "*batch vertices 3"],
+    skin_weights: Float[Tensor, "vertices bones"],
+    world_from_bone: Float[Tensor, "*batch bones 4 4"],
+    rest_joints: Float[Tensor, "*batch bones 3"],
+) -> Float[Tensor, "*batch vertices 3"]:
+    """Posed vertices: weighted sum of the bones' rigid motions from rest.
+
+    Source: paper appendix A, the skinning equation; ``G_b(0)^-1`` is a shift by the rest joint.
+    """
+    rotation = world_from_bone[..., :3, :3]
+    shift = world_from_bone[..., :3, 3] - (rotation @ rest_joints[..., None])[..., 0]
+    motion = torch.cat([rotation.flatten(-2), shift], dim=-1)
+    per_vertex = skin_weights @ motion
+    blended = per_vertex[..., :9].unflatten(-1, (3, 3))
+    return (blended @ rest_vertices[..., None])[..., 0] + per_vertex[..., 9:]

@@ -1,0 +1,1 @@
+"""Sampling, compositing and rasterising: tensors in, tensors out; knows no network."""

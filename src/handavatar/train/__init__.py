@@ -1,0 +1,1 @@
+"""The training loop, its losses, its run folder, and the pre-training of the prior."""
