@@ -10,6 +10,7 @@ import igl
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 
@@ -234,3 +235,12 @@ def uniform_laplacian(
     total = total.index_add(-2, second, vertices[..., first, :])
     valence = torch.bincount(edges.reshape(-1), minlength=vertices.shape[-2]).clamp_min(1)
     return total / valence[:, None].to(vertices) - vertices
+
+
+def distance_between_sets(
+    points: Float[Tensor, "points 3"], others: Float[Tensor, "others 3"]
+) -> Float[Tensor, "points"]:
+    """Distance of each point to the nearest of the others, without gradient."""
+    tree = cKDTree(others.detach().cpu().numpy())
+    distance, _ = tree.query(points.detach().cpu().numpy())
+    return torch.from_numpy(distance).to(points)

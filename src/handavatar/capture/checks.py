@@ -1,0 +1,181 @@
+"""Checks of what comes from outside: paths, JSON, numbers, pictures. Nothing is trusted.
+
+Every check raises :class:`CaptureError` with what was found and what to do; callers add where.
+"""
+
+import json
+import math
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+MAX_JSON_BYTES = 64 * 2**20
+MAX_PIXELS = 64_000_000
+MAX_TEXT = 2000
+
+
+class CaptureError(ValueError):
+    """A capture or motion that cannot be used: what was found, where, and what to do.
+
+    Attributes:
+        what: what was found and what was expected.
+        remedy: what to do about it.
+    """
+
+    def __init__(self, what: str, remedy: str = "") -> None:
+        """Keeps the two halves apart, so that a list of problems can be printed as a table."""
+        super().__init__(f"{what}\n{remedy}" if remedy else what)
+        self.what = what
+        self.remedy = remedy
+
+
+def load_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
+    """A JSON object without NaN, infinity or duplicate keys, of bounded size.
+
+    Raises:
+        CaptureError: if the file is missing, a link, too large, or not such an object.
+    """
+    if path.is_symlink() or not path.is_file():
+        raise CaptureError(
+            f"{path.name} is missing or is not a plain file",
+            "point at the folder that holds it; links are not followed",
+        )
+    if path.stat().st_size > max_bytes:
+        raise CaptureError(
+            f"{path.name} has {path.stat().st_size} bytes, at most {max_bytes} are read",
+            "split the recording into several captures",
+        )
+    try:
+        content = json.loads(
+            path.read_bytes().decode("utf-8"),
+            parse_constant=_refuse_constant,
+            object_pairs_hook=_unique_keys,
+        )
+    except (ValueError, RecursionError) as error:
+        raise CaptureError(
+            f"{path.name} is not JSON that can be read: {str(error)[:200]}",
+            "write the file again with plain numbers and each key once",
+        ) from error
+    if not isinstance(content, dict):
+        raise CaptureError(f"{path.name} holds no JSON object", "its outermost level must be {...}")
+    return content
+
+
+def _refuse_constant(text: str) -> float:
+    raise ValueError(f"{text} is not a number")
+
+
+def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content = dict(pairs)
+    if len(content) != len(pairs):
+        names = [name for name, _ in pairs]
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"the key {twice[:80]!r} appears twice")
+    return content
+
+
+def path_inside(folder: Path, text: object) -> Path:
+    """A file below ``folder`` named by a relative path with forward slashes.
+
+    Raises:
+        CaptureError: if the path is absolute, climbs out, passes a link, or names no plain file.
+    """
+    if not isinstance(text, str) or not 0 < len(text) <= 500 or "\0" in text:
+        raise CaptureError("the path is not a text", 'write a relative path, "images/000000.png"')
+    parts = PurePosixPath(text).parts
+    if text.startswith("/") or ".." in parts or "\\" in text or ":" in text:
+        raise CaptureError(
+            f"the path {text!r} leaves the capture folder",
+            'keep the files inside the folder and write relative paths, "images/000000.png"',
+        )
+    path = folder
+    for part in parts:
+        path = path / part
+        if path.is_symlink():
+            raise CaptureError(f"{text!r} passes through a link", "copy the file into the folder")
+    if not path.is_file():
+        raise CaptureError(f"{text!r} is missing", "restore the file, or drop the frame")
+    return path
+
+
+def number(value: object, label: str, low: float = -math.inf, high: float = math.inf) -> float:
+    """A finite number within bounds, or :class:`CaptureError`."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    # A JSON integer may be too large for a float; comparing is safe where converting is not.
+    if is_number and not -1e300 < value < 1e300:  # type: ignore[operator]
+        is_number = False
+    if not is_number or not low <= float(value) <= high:  # type: ignore[arg-type]
+        raise CaptureError(
+            f"{label} is {str(value)[:60]}, expected a number from {low:g} to {high:g}",
+            f"correct {label}",
+        )
+    return float(value)  # type: ignore[arg-type]
+
+
+def numbers(value: object, shape: tuple[int, ...], label: str) -> np.ndarray:
+    """Nested lists of finite numbers of a given shape, as float64, or :class:`CaptureError`."""
+
+    def walk(item: object, sizes: tuple[int, ...]) -> Any:
+        if not sizes:
+            return number(item, label)
+        if not isinstance(item, list) or len(item) != sizes[0]:
+            found = f"a list of {len(item)}" if isinstance(item, list) else str(item)[:60]
+            raise CaptureError(
+                f"{label} has {found} where {sizes[0]} entries were expected",
+                f"{label} must be nested lists of shape {list(shape)}",
+            )
+        return [walk(each, sizes[1:]) for each in item]
+
+    return np.array(walk(value, shape), dtype=np.float64)
+
+
+def text_field(content: dict[str, Any], key: str, choices: tuple[str, ...] = ()) -> str:
+    """A short text, one of ``choices`` if there are any, or :class:`CaptureError`."""
+    value = content.get(key)
+    if not isinstance(value, str) or len(value) > MAX_TEXT or (choices and value not in choices):
+        expected = " or ".join(choices) if choices else f"a text of at most {MAX_TEXT} characters"
+        raise CaptureError(f"{key} is {str(value)[:60]!r}, expected {expected}", f"set {key}")
+    return value
+
+
+def open_picture(path: Path) -> Image.Image:
+    """A PNG or JPEG whose header is sound; no pixel is decoded yet.
+
+    Raises:
+        CaptureError: if it is another kind of file or has more than 64 megapixels.
+    """
+    try:
+        picture = Image.open(path, formats=("PNG", "JPEG"))
+    except Image.DecompressionBombError as error:
+        raise CaptureError(
+            f"{path.name} claims more than {MAX_PIXELS // 10**6} megapixels", "make it smaller"
+        ) from error
+    except (OSError, ValueError, SyntaxError) as error:
+        raise CaptureError(
+            f"{path.name} is not a PNG or JPEG that can be read", "save it again as PNG"
+        ) from error
+    width, height = picture.size
+    if width * height > MAX_PIXELS:
+        picture.close()
+        raise CaptureError(
+            f"{path.name} is {width} x {height}, more than {MAX_PIXELS // 10**6} megapixels",
+            "make it smaller",
+        )
+    return picture
+
+
+def decoded(picture: Image.Image, name: str) -> np.ndarray:
+    """All pixels of an opened picture; closes it.
+
+    Raises:
+        CaptureError: if the file ends early or is damaged.
+    """
+    try:
+        with picture:
+            return np.array(picture)
+    except (OSError, ValueError, SyntaxError) as error:
+        raise CaptureError(
+            f"{name} is damaged: {str(error)[:120]}", "restore the file, or drop the frame"
+        ) from error

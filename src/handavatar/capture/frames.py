@@ -1,0 +1,563 @@
+"""A capture: frames of one hand with a known camera and pose, in a folder on disk.
+
+``transforms.json`` is a superset of nerfstudio's. On disk a camera is camera-to-world in OpenGL
+axes (x right, y up, z backwards); in memory it is ``camera_from_world`` in OpenCV axes (x right,
+y down, z forward). :func:`opencv_from_opengl` and its inverse are the only place where one becomes
+the other. The principal point needs no conversion: nerfstudio, COLMAP and this project all count
+image coordinates from the corner, so that the centre of the first pixel is (0.5, 0.5).
+
+A left hand is stored mirrored to a right one (image, mask, camera and pose alike) with
+``side: left``; whoever shows a result mirrors it back.
+"""
+
+import json
+import math
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image
+from torch import Tensor
+
+from handavatar.capture.checks import (
+    CaptureError,
+    decoded,
+    load_json,
+    number,
+    numbers,
+    open_picture,
+    path_inside,
+    text_field,
+)
+from handavatar.geometry.cameras import Camera
+from handavatar.geometry.rotations import invert_rigid
+from handavatar.hand.pose import NUM_BONES, HandPose
+
+SCHEMA = 1
+SPLITS = ("train", "val", "test")
+MAX_FRAMES = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture of the hand, decoded.
+
+    Attributes:
+        name: unique within the capture, e.g. ``000012``.
+        image: sRGB, 8 bit, as stored; the background is kept.
+        mask: true on the hand.
+        camera: OpenCV axes, of exactly this picture.
+        pose: one hand; rotations of 16 bones, translation in metres.
+        confidence: how far the pose is to be trusted, in [0, 1].
+        split: ``train``, ``val`` or ``test``.
+        time: seconds since the start of the recording.
+    """
+
+    name: str
+    image: UInt8[Tensor, "height width 3"]
+    mask: Bool[Tensor, "height width"]
+    camera: Camera
+    pose: HandPose
+    confidence: float
+    split: str
+    time: float
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRecord:
+    """What a capture says of one frame, without its pixels.
+
+    Attributes:
+        name: as in :class:`Frame`, and so are the fields not named here.
+        file_path: picture, relative to the folder.
+        mask_path: mask, relative to the folder.
+    """
+
+    name: str
+    file_path: str
+    mask_path: str
+    camera: Camera
+    pose: HandPose
+    confidence: float
+    split: str
+    time: float
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something wrong with a capture folder.
+
+    Attributes:
+        file: relative to the folder.
+        frame: name of the frame; empty if the whole capture is meant.
+        what: what was found and what was expected.
+        remedy: what to do.
+    """
+
+    file: str
+    frame: str
+    what: str
+    remedy: str
+
+    def __str__(self) -> str:
+        """Two lines: what and where, then the remedy."""
+        where = f"{self.file}, frame {self.frame}" if self.frame else self.file
+        return f"{where}: {self.what}\n  {self.remedy}"
+
+
+@dataclass(frozen=True, eq=False)
+class Capture:
+    """A folder of frames, read and found sound as far as the headers of its files tell.
+
+    Attributes:
+        folder: where it lies.
+        rig_name: the rig its poses belong to.
+        rig_sha256: fingerprint of that rig.
+        side: ``right``, or ``left`` if everything is stored mirrored.
+        subject: whose hand.
+        color_space: always ``srgb``.
+        source: where the pictures come from.
+        licence: under which terms.
+        shape_coefficients: of that rig; zeros if they are not known.
+        records: frames in the order of the file.
+    """
+
+    folder: Path
+    rig_name: str
+    rig_sha256: str
+    side: str
+    subject: str
+    color_space: str
+    source: str
+    licence: str
+    shape_coefficients: Float[Tensor, "shapes"]
+    records: tuple[FrameRecord, ...]
+
+    def frame(self, index: int) -> Frame:
+        """Decodes one frame.
+
+        Raises:
+            CaptureError: if a file was damaged or changed since the capture was read.
+        """
+        record = self.records[index]
+        size = (record.camera.width, record.camera.height)
+        image = _pixels(self.folder, record.file_path, size, ("RGB",), record.name)
+        mask = _pixels(self.folder, record.mask_path, size, ("L", "1"), record.name)
+        return Frame(
+            name=record.name,
+            image=torch.from_numpy(image),
+            mask=torch.from_numpy(mask > 127 if mask.dtype != bool else mask),
+            camera=record.camera,
+            pose=record.pose,
+            confidence=record.confidence,
+            split=record.split,
+            time=record.time,
+        )
+
+    def split(self, name: str) -> tuple[int, ...]:
+        """Indices of the frames of ``train``, ``val`` or ``test``; may be empty."""
+        if name not in SPLITS:
+            raise CaptureError(f"there is no split {name!r}", f"ask for one of {', '.join(SPLITS)}")
+        return tuple(i for i, record in enumerate(self.records) if record.split == name)
+
+    @cached_property
+    def sha256(self) -> str:
+        """Fingerprint of ``transforms.json``."""
+        return sha256((self.folder / "transforms.json").read_bytes()).hexdigest()
+
+
+def read_capture(folder: Path) -> Capture:
+    """Reads ``transforms.json`` and the headers of all pictures; decodes nothing.
+
+    Raises:
+        CaptureError: the first problem, with file, frame and remedy.
+    """
+    capture, problems = _examined(Path(folder))
+    if problems or capture is None:
+        more = (
+            f"\nand {len(problems) - 1} more: handavatar capture check {folder}"
+            if len(problems) > 1
+            else ""
+        )
+        raise CaptureError(f"{folder}\n{problems[0]}{more}")
+    return capture
+
+
+def find_problems(folder: Path) -> list[Problem]:
+    """Everything wrong with a capture folder, pixels included; empty if it is sound."""
+    capture, problems = _examined(Path(folder))
+    for index, record in enumerate(capture.records if capture else ()):
+        try:
+            frame = capture.frame(index)  # type: ignore[union-attr]
+        except CaptureError as error:
+            problems.append(Problem(record.file_path, record.name, error.what, error.remedy))
+            continue
+        if not bool(frame.mask.any()):
+            problems.append(
+                Problem(record.mask_path, record.name, "the mask is empty", "drop the frame")
+            )
+    return problems
+
+
+def opencv_from_opengl(world_from_camera: np.ndarray) -> Float[Tensor, "4 4"]:
+    """``camera_from_world`` in OpenCV axes of a camera-to-world matrix in OpenGL axes."""
+    flipped = world_from_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
+    return invert_rigid(torch.from_numpy(flipped)).float()
+
+
+def opengl_from_opencv(camera_from_world: Float[Tensor, "4 4"]) -> np.ndarray:
+    """Camera-to-world in OpenGL axes of ``camera_from_world`` in OpenCV axes."""
+    world_from_camera = invert_rigid(camera_from_world.detach().cpu().double()).numpy()
+    return world_from_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+def _examined(folder: Path) -> tuple[Capture | None, list[Problem]]:
+    """The capture as far as it can be read, and all problems that show without decoding."""
+    try:
+        content = load_json(folder / "transforms.json")
+        header = _header(content)
+        entries = content.get("frames")
+        if not isinstance(entries, list) or not 0 < len(entries) <= MAX_FRAMES:
+            raise CaptureError(
+                f"frames is not a list of 1 to {MAX_FRAMES} frames", "list at least one frame"
+            )
+    except CaptureError as error:
+        return None, [Problem("transforms.json", "", error.what, error.remedy)]
+    records: dict[str, FrameRecord] = {}
+    problems: list[Problem] = []
+    for index, entry in enumerate(entries):
+        label = f"#{index}"
+        try:
+            if not isinstance(entry, dict):
+                raise CaptureError("the frame is not a JSON object", "write it as {...}")
+            label = Path(str(entry.get("file_path", label))[:200]).stem
+            record = _record(folder, content, entry, index)
+            if record.name in records:
+                raise CaptureError(
+                    f"two frames are named {record.name}", "give every picture its own name"
+                )
+            records[record.name] = record
+        except CaptureError as error:
+            file = str(entry.get("file_path", "transforms.json"))[:200] if entry else ""
+            problems.append(Problem(file, label, error.what, error.remedy))
+    return Capture(folder=folder, records=tuple(records.values()), **header), problems
+
+
+def _header(content: dict[str, Any]) -> dict[str, Any]:
+    """The capture's own fields, as keyword arguments of :class:`Capture`."""
+    ours = content.get("handavatar")
+    if not isinstance(ours, dict):
+        raise CaptureError(
+            "there is no handavatar block: a nerfstudio capture does not know the hand's pose",
+            "make the capture with handavatar capture video, interhand or synth",
+        )
+    if ours.get("schema") != SCHEMA:
+        raise CaptureError(
+            f"schema is {str(ours.get('schema'))[:20]}, this program reads {SCHEMA}",
+            "update handavatar, or make the capture again",
+        )
+    rig = ours.get("rig")
+    if not isinstance(rig, dict):
+        raise CaptureError("rig is missing", 'write rig: {"name": ..., "sha256": ...}')
+    coefficients = ours.get("shape_coefficients", [0.0] * 10)
+    if not isinstance(coefficients, list) or len(coefficients) > 1000:
+        raise CaptureError("shape_coefficients is not a short list", "leave it out if unknown")
+    model = content.get("camera_model", "OPENCV")
+    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
+        raise CaptureError(f"camera_model is {str(model)[:40]!r}", "undistort to a pinhole camera")
+    return {
+        "rig_name": text_field(rig, "name"),
+        "rig_sha256": text_field(rig, "sha256"),
+        "side": text_field(ours, "side", ("left", "right")),
+        "subject": text_field(ours, "subject"),
+        "color_space": text_field(ours, "color_space", ("srgb",)),
+        "source": text_field(ours, "source"),
+        "licence": text_field(ours, "licence"),
+        "shape_coefficients": torch.from_numpy(
+            numbers(coefficients, (len(coefficients),), "shape_coefficients")
+        ).float(),
+    }
+
+
+def _record(
+    folder: Path, content: dict[str, Any], entry: dict[str, Any], index: int
+) -> FrameRecord:
+    file_path = path_inside(folder, entry.get("file_path"))
+    mask_path = path_inside(folder, entry.get("mask_path"))
+    size = _size_of_picture(file_path, ("RGB",))
+    mask_size = _size_of_picture(mask_path, ("L", "1"))
+    if mask_size != size:
+        raise CaptureError(
+            f"the mask {entry['mask_path']} is {mask_size[0]} x {mask_size[1]}, "
+            f"the picture {size[0]} x {size[1]}",
+            "make both the same size",
+        )
+    camera = _camera({**content, **entry}, size)
+    hand = entry.get("hand")
+    if not isinstance(hand, dict):
+        raise CaptureError("the frame has no hand pose", 'write hand: {"rotations": ...}')
+    rotations = numbers(hand.get("rotations"), (NUM_BONES, 3), "rotations")
+    largest = float(np.linalg.norm(rotations, axis=-1).max())
+    if largest > 2 * math.pi + 1e-3:
+        raise CaptureError(
+            f"a joint turns by {largest:.1f} radians, at most 6.28 make sense",
+            "write rotations as axis times angle in radians, not in degrees",
+        )
+    translation = numbers(hand.get("translation"), (3,), "translation")
+    transform = camera.camera_from_world.double().numpy()
+    depth = float(transform[2, :3] @ translation + transform[2, 3])
+    if not 0 < depth < 100:
+        raise CaptureError(
+            f"the wrist lies {depth:.3g} m in front of the camera, expected 0 to 100",
+            "write metres, and transform_matrix as camera-to-world in OpenGL axes",
+        )
+    return FrameRecord(
+        name=file_path.stem,
+        file_path=file_path.relative_to(folder).as_posix(),
+        mask_path=mask_path.relative_to(folder).as_posix(),
+        camera=camera,
+        pose=HandPose(torch.from_numpy(rotations).float(), torch.from_numpy(translation).float()),
+        confidence=number(hand.get("confidence", 1.0), "confidence", 0.0, 1.0),
+        split=text_field(entry, "split", SPLITS),
+        time=number(entry.get("time", float(index)), "time"),
+    )
+
+
+def _camera(entry: dict[str, Any], size: tuple[int, int]) -> Camera:
+    """The pinhole camera of one frame; a frame's own intrinsics go before the common ones."""
+    for name in ("k1", "k2", "k3", "k4", "p1", "p2"):
+        if number(entry.get(name, 0.0), name) != 0:
+            raise CaptureError(f"the lens distortion {name} is not zero", "undistort the pictures")
+    for name, length in (("w", size[0]), ("h", size[1])):
+        if number(entry.get(name, length), name) != length:
+            raise CaptureError(
+                f"{name} is {str(entry[name])[:20]}, the picture has {length}", f"correct {name}"
+            )
+    matrix = numbers(entry.get("transform_matrix"), (4, 4), "transform_matrix")
+    rotation = matrix[:3, :3]
+    is_rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
+    if not is_rigid or np.linalg.det(rotation) < 0 or list(matrix[3]) != [0, 0, 0, 1]:
+        raise CaptureError(
+            "transform_matrix is not a rotation and a translation",
+            "its upper left 3 x 3 must be orthonormal, its last row 0 0 0 1",
+        )
+    return Camera(
+        focal=(
+            number(entry.get("fl_x"), "fl_x", 1e-3, 1e6),
+            number(entry.get("fl_y", entry.get("fl_x")), "fl_y", 1e-3, 1e6),
+        ),
+        center=(
+            number(entry.get("cx"), "cx", -1e6, 1e6),
+            number(entry.get("cy"), "cy", -1e6, 1e6),
+        ),
+        width=size[0],
+        height=size[1],
+        camera_from_world=opencv_from_opengl(matrix),
+    )
+
+
+def _size_of_picture(path: Path, modes: tuple[str, ...]) -> tuple[int, int]:
+    """Width and height by the header alone."""
+    with open_picture(path) as picture:
+        if picture.mode not in modes:
+            raise CaptureError(
+                f"{path.name} has channels {picture.mode}, expected {' or '.join(modes)}",
+                "save pictures as 8-bit RGB without alpha, masks as 8-bit grey",
+            )
+        return picture.size
+
+
+def _pixels(
+    folder: Path, relative: str, size: tuple[int, int], modes: tuple[str, ...], frame: str
+) -> np.ndarray:
+    try:
+        path = path_inside(folder, relative)
+        if _size_of_picture(path, modes) != size:
+            raise CaptureError("the picture changed since it was checked", "read the capture again")
+        return decoded(open_picture(path), relative)
+    except CaptureError as error:
+        raise CaptureError(f"frame {frame}: {error.what}", error.remedy) from error
+
+
+class CaptureWriter:
+    """Writes a capture aside and puts it in place only when it is whole.
+
+    Used in a ``with`` block: frames go into a temporary folder beside the target; leaving the
+    block reads the result back and renames it, leaving it by an exception removes it.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        rig_name: str,
+        rig_sha256: str,
+        subject: str,
+        source: str,
+        licence: str,
+        side: str = "right",
+        shape_coefficients: Float[Tensor, "shapes"] | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        """Refuses a folder that is in use before any work is done.
+
+        Args:
+            folder: where the capture is to be.
+            rig_name: the rig the poses belong to.
+            rig_sha256: its fingerprint.
+            subject: whose hand.
+            source: where the pictures come from.
+            licence: under which terms.
+            side: ``left`` if what is written was mirrored.
+            shape_coefficients: of the rig, or None if they are not known.
+            overwrite: replace a capture that is already there; never any other folder.
+
+        Raises:
+            CaptureError: if ``folder`` is not empty.
+        """
+        self.folder = Path(folder).absolute()
+        self._overwrite = overwrite
+        self._header = {
+            "schema": SCHEMA,
+            "rig": {"name": rig_name, "sha256": rig_sha256},
+            "side": side,
+            "subject": subject,
+            "color_space": "srgb",
+            "source": source,
+            "licence": licence,
+        }
+        if shape_coefficients is not None:
+            self._header["shape_coefficients"] = shape_coefficients.double().tolist()
+        self._entries: list[dict[str, Any]] = []
+        self._refuse_folder_in_use()
+
+    def _refuse_folder_in_use(self) -> None:
+        if not self.folder.exists() or (self.folder.is_dir() and not any(self.folder.iterdir())):
+            return
+        if not self._overwrite:
+            raise CaptureError(
+                f"{self.folder} exists and is not empty", "name another folder, or use --overwrite"
+            )
+        if not (self.folder / "transforms.json").is_file() or self.folder.is_symlink():
+            raise CaptureError(
+                f"{self.folder} is no capture: it will not be overwritten", "name another folder"
+            )
+
+    def __enter__(self) -> "CaptureWriter":
+        """Makes the temporary folder."""
+        self.folder.parent.mkdir(parents=True, exist_ok=True)
+        self._aside = Path(
+            tempfile.mkdtemp(prefix=f".{self.folder.name}.", suffix=".part", dir=self.folder.parent)
+        )
+        return self
+
+    def file(self, relative: str) -> Path:
+        """Where to write a further file of the capture, such as ``truth/albedo/000000.png``."""
+        path = self._aside / relative
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return path
+
+    def add(self, frame: Frame) -> None:
+        """Writes one frame's picture and mask.
+
+        Raises:
+            CaptureError: if its pose is not finite or its name is no plain file name.
+        """
+        if not re.fullmatch(r"[A-Za-z0-9_-]{1,100}", frame.name):
+            raise CaptureError(f"{frame.name!r} is no name for a frame", "use letters and digits")
+        image_path, mask_path = f"images/{frame.name}.png", f"masks/{frame.name}.png"
+        if any(entry["file_path"] == image_path for entry in self._entries):
+            raise CaptureError(f"two frames are named {frame.name}", "number the frames")
+        pose = {
+            "rotations": frame.pose.rotations.detach().cpu().double(),
+            "translation": frame.pose.translation.detach().cpu().double(),
+        }
+        for name, value in pose.items():
+            if not bool(torch.isfinite(value).all()):
+                raise CaptureError(
+                    f"frame {frame.name}: the {name} of its pose are not finite", "drop the frame"
+                )
+        Image.fromarray(frame.image.cpu().numpy()).save(self.file(image_path))
+        mask = frame.mask.cpu().numpy().astype(np.uint8) * 255
+        Image.fromarray(mask).save(self.file(mask_path))
+        camera = frame.camera
+        self._entries.append(
+            {
+                "file_path": image_path,
+                "mask_path": mask_path,
+                "fl_x": camera.focal[0],
+                "fl_y": camera.focal[1],
+                "cx": camera.center[0],
+                "cy": camera.center[1],
+                "w": camera.width,
+                "h": camera.height,
+                "transform_matrix": opengl_from_opencv(camera.camera_from_world).tolist(),
+                "split": frame.split,
+                "time": frame.time,
+                "hand": {
+                    **{name: value.tolist() for name, value in pose.items()},
+                    "confidence": frame.confidence,
+                },
+            }
+        )
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Puts the whole capture in place, or removes what there is of it."""
+        try:
+            if kind is None:
+                self._finish()
+        finally:
+            shutil.rmtree(self._aside, ignore_errors=True)
+
+    def _finish(self) -> None:
+        content = {
+            "camera_model": "OPENCV",
+            "handavatar": self._header,
+            "frames": self._entries,
+        }
+        try:
+            text = json.dumps(content, allow_nan=False)
+        except ValueError as error:
+            raise CaptureError("a camera or time is not finite", "drop the frame") from error
+        with open(self._aside / "transforms.json", "w", encoding="utf-8") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+        read_capture(self._aside)
+        self._refuse_folder_in_use()
+        self._aside.chmod(0o755)
+        if not self.folder.exists():
+            self._aside.rename(self.folder)
+            return
+        old = Path(tempfile.mkdtemp(prefix=f".{self.folder.name}.", dir=self.folder.parent))
+        self.folder.rename(old)
+        try:
+            self._aside.rename(self.folder)
+        except OSError:
+            old.rename(self.folder)
+            raise
+        shutil.rmtree(old)
+
+
+def write_capture(folder: Path, frames: Iterable[Frame], **header: Any) -> Capture:
+    """Writes a whole capture; ``header`` as the keyword arguments of :class:`CaptureWriter`."""
+    with CaptureWriter(folder, **header) as writer:
+        for frame in frames:
+            writer.add(frame)
+    return read_capture(folder)

@@ -1,0 +1,404 @@
+"""The local-pair occupancy field ("PairOF"): inside or outside, per part and for the whole hand.
+
+Every part's surface points are encoded by a shared PointNet; two physically connected parts are
+decoded together, so that each knows where the other continues. Part boxes belong to the model: a
+part has no occupancy outside its box, so culling by boxes changes nothing.
+
+Two ways to evaluate the same field live side by side: :meth:`PairOccupancy.plain` decodes every
+pair at every point and is obvious; :meth:`PairOccupancy.forward` decodes only pairs whose boxes
+hold the point, shares first layers between pairs, and is fast.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from handavatar.field.layers import PointNet, ResidualBlock, SkipMLP
+from handavatar.hand.parts import PartBoxes, Parts
+from handavatar.hand.pose import CONNECTED_PAIRS, NUM_BONES
+from handavatar.hand.rig import PosedHand
+
+CODE_WIDTH = 64
+LENGTH_SCALE = 20.0
+"""Bone-frame metres are multiplied by this before any network sees them (5 cm become 1)."""
+LOGIT_SCALE = 10.0
+"""The decoder's output is multiplied by this: a surface needs logits of some units per mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class HandCodes:
+    """All that the occupancy of one posed hand depends on.
+
+    Attributes:
+        part_codes: encoding of each part's surface.
+        boxes: the part boxes in their bones' frames.
+    """
+
+    part_codes: Float[Tensor, "bones 64"]
+    boxes: PartBoxes
+
+
+@dataclass(frozen=True, eq=False)
+class PairItems:
+    """Pairs to decode: which points, which pairs, and which of the two answers are wanted."""
+
+    points: Int[Tensor, "items"]
+    pairs: Int[Tensor, "items"]
+    is_wanted: Bool[Tensor, "items 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class Occupancy:
+    """Occupancy at points.
+
+    Attributes:
+        whole: of the hand, in [0, 1], surface at 0.5.
+        soft_parts: soft occupancy of each part, in [0, 1], zero outside its box.
+        winners: per point, the index into ``items`` and the side (0 or 1) of the decoded answers
+            that decide the value; all answers for a fusion that mixes them.
+        items: the decoded pairs that decide the values.
+    """
+
+    whole: Float[Tensor, "points"]
+    soft_parts: Float[Tensor, "points bones"]
+    items: PairItems
+
+
+def occupancy_from_logits(logits: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """Sigmoid; minus infinity (no box holds the point) gives zero.
+
+    Source: paper Sec. 3.2, Eq. 1 (sigma).
+    """
+    return torch.sigmoid(logits)
+
+
+def soft_occupancy(
+    logits: Float[Tensor, "*batch"], softness: float = 0.05
+) -> Float[Tensor, "*batch"]:
+    """Sigmoid with a gentle slope, so that near and far outside differ.
+
+    Args:
+        logits: part logits; minus infinity gives zero.
+        softness: the paper's tau, in (0, 1).
+
+    Source: paper Sec. 3.3, Eq. 3.
+    """
+    return torch.sigmoid(softness * logits)
+
+
+def box_fade(
+    local_points: Float[Tensor, "points bones 3"], boxes: PartBoxes
+) -> Float[Tensor, "points bones"]:
+    """1 inside a part's own box, falling smoothly to 0 at ``margin`` outside it.
+
+    Departs: in the authors' code the soft occupancy jumps to zero at the border of the enlarged
+        box; here it is faded, so that the illumination's input is continuous.
+    """
+    outside = torch.maximum(boxes.lower - local_points, local_points - boxes.upper).amax(-1)
+    ramp = (1 - outside / boxes.margin).clamp(0, 1)
+    return ramp * ramp * (3 - 2 * ramp)
+
+
+class MaximumFusion:
+    """The paper's fusion: the largest logit over pairs, then the largest part."""
+
+    def over_pairs(
+        self,
+        logits: Float[Tensor, "answers"],
+        slots: Int[Tensor, "answers"],
+        num_slots: int,
+        slope: float,
+    ) -> Float[Tensor, "slots"]:
+        """Value of each slot (a part at a point): sigmoid of ``slope`` times the largest logit."""
+        lowest = logits.new_full((num_slots,), -torch.inf)
+        return torch.sigmoid(slope * lowest.scatter_reduce(0, slots, logits, "amax"))
+
+    def over_parts(self, parts: Float[Tensor, "points bones"]) -> Float[Tensor, "points"]:
+        """Value of the whole hand.
+
+        Source: paper Sec. 3.2, the global occupancy.
+        """
+        return parts.amax(-1)
+
+    def deciding(
+        self, logits: Float[Tensor, "answers"], points: Int[Tensor, "answers"], num_points: int
+    ) -> Int[Tensor, "deciding"]:
+        """Indices of the answers that the whole hand's value depends on: one per point."""
+        highest = logits.new_full((num_points,), -torch.inf).scatter_reduce(
+            0, points, logits, "amax"
+        )
+        candidates = (logits == highest[points]).nonzero()[:, 0]
+        first = torch.full((num_points,), len(logits), device=logits.device)
+        first = first.scatter_reduce(0, points[candidates], candidates, "amin")
+        return first[first < len(logits)]
+
+
+class SoftmaxFusion:
+    """The authors' fusion: sigmoid first, then softmax-weighted means over pairs and parts.
+
+    Departs: not in the paper; selectable to compare with the released code.
+    """
+
+    temperature = 0.05
+
+    def over_pairs(
+        self,
+        logits: Float[Tensor, "answers"],
+        slots: Int[Tensor, "answers"],
+        num_slots: int,
+        slope: float,
+    ) -> Float[Tensor, "slots"]:
+        """Softmax-weighted mean of the sigmoids in each slot; zero where there are none."""
+        values = torch.sigmoid(slope * logits)
+        weights = (values / self.temperature).exp()
+        empty = logits.new_zeros(num_slots)
+        total = empty.scatter_add(0, slots, weights)
+        return empty.scatter_add(0, slots, weights * values) / (total + 1e-5)
+
+    def over_parts(self, parts: Float[Tensor, "points bones"]) -> Float[Tensor, "points"]:
+        """Softmax-weighted mean over the parts whose value is not zero."""
+        weights = (parts / self.temperature).exp() * (parts > 0)
+        return (weights * parts).sum(-1) / (weights.sum(-1) + 1e-5)
+
+    def deciding(
+        self, logits: Float[Tensor, "answers"], points: Int[Tensor, "answers"], num_points: int
+    ) -> Int[Tensor, "deciding"]:
+        """Every answer decides."""
+        return torch.arange(len(logits), device=logits.device)
+
+
+class PairDecoder(nn.Module):
+    """Two part encodings with their canonical queries -> one logit for each of the two.
+
+    Source: paper Sec. 3.2 and appendix (local-pair decoder).
+    """
+
+    def __init__(self) -> None:
+        """Sizes as in the paper's tables."""
+        super().__init__()
+        self.pointnet = PointNet(CODE_WIDTH + 3, CODE_WIDTH, is_pooled=False)
+        self.mlp = SkipMLP(CODE_WIDTH, 128, 1)
+
+    def forward(
+        self, codes: Float[Tensor, "items 2 64"], queries: Float[Tensor, "items 2 3"]
+    ) -> Float[Tensor, "items 2"]:
+        """Logits, positive inside.
+
+        Args:
+            codes: part encodings.
+            queries: the point in the two bones' frames, times ``LENGTH_SCALE``.
+        """
+        features = self.pointnet(torch.cat([codes, queries], dim=-1))
+        return LOGIT_SCALE * self.mlp(features)[..., 0]
+
+
+class PairOccupancy(nn.Module):
+    """PairOF: part encoder, pair decoder, fusion.
+
+    Source: paper Sec. 3.2. 232,513 parameters (the paper says 237K; the authors' code counts
+        232,513 as well).
+    """
+
+    pairs: Tensor
+
+    def __init__(
+        self,
+        fusion: MaximumFusion | SoftmaxFusion | None = None,
+        softness: float = 0.05,
+        margin: float = 0.012,
+        chunk: int = 4096,
+    ) -> None:
+        """Builds an untrained field.
+
+        Args:
+            fusion: how the answers of several pairs and parts become one; default the maximum.
+            softness: the paper's tau.
+            margin: how far a part's box reaches beyond the part, metres.
+            chunk: points evaluated at a time without gradient.
+
+        Departs: the authors' boxes are twice the size of the part. A fixed margin gives fingers
+            the same reach, and spares the wide empty space that doubling the palm encloses.
+        """
+        super().__init__()
+        self.encoder = PointNet(6, CODE_WIDTH)
+        self.decoder = PairDecoder()
+        self.fusion = fusion or MaximumFusion()
+        self.softness = softness
+        self.margin = margin
+        self.chunk = chunk
+        self.register_buffer("pairs", torch.tensor(CONNECTED_PAIRS), persistent=False)
+
+    def encode(self, parts: Parts, posed: PosedHand) -> HandCodes:
+        """Encodes the surface of a posed hand; once per pose."""
+        clouds = parts.point_clouds(posed)
+        scaled = torch.cat([clouds[..., :3] * LENGTH_SCALE, clouds[..., 3:]], dim=-1)
+        return HandCodes(self.encoder(scaled), parts.boxes(posed, self.margin))
+
+    def forward(self, codes: HandCodes, points: Float[Tensor, "points 3"]) -> Occupancy:
+        """Occupancy at world points (metres), without gradient; the fast way."""
+        pieces = []
+        with torch.no_grad():
+            for start in range(0, max(len(points), 1), self.chunk):
+                pieces.append(self._chunk_occupancy(codes, points[start : start + self.chunk]))
+        offsets = range(0, max(len(points), 1), self.chunk)
+        items = PairItems(
+            torch.cat([p.items.points + offset for p, offset in zip(pieces, offsets)]),
+            torch.cat([p.items.pairs for p in pieces]),
+            torch.cat([p.items.is_wanted for p in pieces]),
+        )
+        return Occupancy(
+            torch.cat([p.whole for p in pieces]), torch.cat([p.soft_parts for p in pieces]), items
+        )
+
+    def of_items(
+        self, codes: HandCodes, points: Float[Tensor, "points 3"], items: PairItems
+    ) -> Float[Tensor, "points"]:
+        """Occupancy with gradient, from the given pairs alone.
+
+        With the items that :meth:`forward` found to decide, value and gradient equal those of
+        the full evaluation, at a fraction of the work.
+        """
+        logits = self._decode(codes, points, items)
+        slots = (items.points[:, None] * NUM_BONES + self.pairs[items.pairs])[items.is_wanted]
+        parts = self.fusion.over_pairs(
+            logits[items.is_wanted], slots, len(points) * NUM_BONES, slope=1.0
+        )
+        return self.fusion.over_parts(parts.view(-1, NUM_BONES))
+
+    def plain(
+        self, codes: HandCodes, points: Float[Tensor, "points 3"]
+    ) -> tuple[Float[Tensor, "points"], Float[Tensor, "points bones"]]:
+        """Occupancy and soft part occupancy, every pair at every point, with gradient.
+
+        The slow and obvious evaluation that the fast one is tested against.
+        """
+        num_points, num_pairs = len(points), len(self.pairs)
+        local = local_points(codes.boxes, points)
+        is_in_box = contains(codes.boxes, local)
+        items = PairItems(
+            torch.arange(num_points, device=points.device).repeat_interleave(num_pairs),
+            torch.arange(num_pairs, device=points.device).repeat(num_points),
+            is_in_box[:, self.pairs].flatten(0, 1),
+        )
+        logits = self._decode(codes, points, items)[items.is_wanted]
+        slots = (items.points[:, None] * NUM_BONES + self.pairs[items.pairs])[items.is_wanted]
+        size = num_points * NUM_BONES
+        parts = self.fusion.over_pairs(logits, slots, size, slope=1.0).view(-1, NUM_BONES)
+        soft = self.fusion.over_pairs(logits, slots, size, self.softness).view(-1, NUM_BONES)
+        return self.fusion.over_parts(parts), soft * box_fade(local, codes.boxes)
+
+    def _decode(
+        self, codes: HandCodes, points: Float[Tensor, "points 3"], items: PairItems
+    ) -> Float[Tensor, "items 2"]:
+        members = self.pairs[items.pairs]
+        transforms = codes.boxes.bone_from_world[members]
+        position = points[items.points][:, None, :, None]
+        queries = (transforms[..., :3, :3] @ position)[..., 0] + transforms[..., :3, 3]
+        return self.decoder(codes.part_codes[members], queries * LENGTH_SCALE)
+
+    def _chunk_occupancy(self, codes: HandCodes, points: Float[Tensor, "points 3"]) -> Occupancy:
+        """The fast evaluation: the same function as :meth:`plain`, by exact algebra.
+
+        Only pairs with a box that holds the point are decoded; the constant part code enters
+        the first layer as a bias; the first block runs once per part instead of once per pair;
+        the pooled half of every later block runs once per pair instead of once per member; the
+        last block and the MLP run for wanted answers only.
+        """
+        num_points = len(points)
+        local = local_points(codes.boxes, points)
+        is_in_box = contains(codes.boxes, local)
+        first, second = self.pairs.unbind(-1)
+        is_active = is_in_box[:, first] | is_in_box[:, second]
+        pair_index, point_index = is_active.T.nonzero().unbind(-1)
+        is_needed = torch.zeros_like(is_in_box)
+        for column, (a, b) in enumerate(CONNECTED_PAIRS):
+            is_needed[:, a] |= is_active[:, column]
+            is_needed[:, b] |= is_active[:, column]
+        features, row_of = self._part_features(codes, local, is_needed)
+
+        members = self.pairs[pair_index]
+        rows = row_of[members, point_index[:, None]]
+        tokens = features[rows]
+        blocks = list(self.decoder.pointnet.blocks)
+        for block in blocks[1:-1]:
+            tokens = _paired_block(block, tokens, tokens.amax(1))
+        is_wanted = is_in_box[point_index[:, None], members]
+        item_of_answer = is_wanted.nonzero()[:, 0]
+        answers = _paired_block(
+            blocks[-1], tokens[is_wanted][:, None], tokens.amax(1)[item_of_answer]
+        )[:, 0]
+        answers = self.decoder.pointnet.output(answers.relu_())
+        logits = LOGIT_SCALE * self.decoder.mlp(answers)[:, 0]
+
+        answer_points = point_index[item_of_answer]
+        slots = answer_points * NUM_BONES + members[is_wanted]
+        size = num_points * NUM_BONES
+        parts = self.fusion.over_pairs(logits, slots, size, slope=1.0).view(-1, NUM_BONES)
+        soft = self.fusion.over_pairs(logits, slots, size, self.softness).view(-1, NUM_BONES)
+        deciding = self.fusion.deciding(logits, answer_points, num_points)
+        side = is_wanted.nonzero()[:, 1][deciding]
+        items = PairItems(
+            answer_points[deciding],
+            pair_index[item_of_answer[deciding]],
+            torch.nn.functional.one_hot(side, 2).bool(),
+        )
+        return Occupancy(self.fusion.over_parts(parts), soft * box_fade(local, codes.boxes), items)
+
+    def _part_features(
+        self,
+        codes: HandCodes,
+        local: Float[Tensor, "points bones 3"],
+        is_needed: Bool[Tensor, "points bones"],
+    ) -> tuple[Float[Tensor, "tokens 64"], Int[Tensor, "bones points"]]:
+        """First layer and block per needed (part, point), and where to find them."""
+        layer = self.decoder.pointnet.input
+        biases = layer.bias + codes.part_codes @ layer.weight[:, :CODE_WIDTH].T
+        position_weight = LENGTH_SCALE * layer.weight[:, CODE_WIDTH:].T
+        needed = is_needed.T
+        counts = needed.sum(-1).tolist()
+        row_of = needed.flatten().cumsum(0).view_as(needed) - 1
+        features = local.new_empty(sum(counts), layer.out_features)
+        start = 0
+        for bone, count in enumerate(counts):
+            inside = local[:, bone][needed[bone]]
+            torch.addmm(biases[bone], inside, position_weight, out=features[start : start + count])
+            start += count
+        return self.decoder.pointnet.blocks[0](features), row_of
+
+
+def local_points(
+    boxes: PartBoxes, points: Float[Tensor, "points 3"]
+) -> Float[Tensor, "points bones 3"]:
+    """World points in the frame of every bone, metres.
+
+    Source: paper Sec. 3.2, the canonicalised query.
+    """
+    rotation = boxes.bone_from_world[:, :3, :3].reshape(-1, 3)
+    shift = boxes.bone_from_world[:, :3, 3].reshape(-1)
+    return (points @ rotation.T + shift).view(len(points), -1, 3)
+
+
+def contains(
+    boxes: PartBoxes, local: Float[Tensor, "points bones 3"]
+) -> Bool[Tensor, "points bones"]:
+    """Whether each part's box, margin included, holds the point."""
+    lower, upper = boxes.lower - boxes.margin, boxes.upper + boxes.margin
+    return ((local > lower) & (local < upper)).all(-1)
+
+
+def _paired_block(
+    block: ResidualBlock,
+    tokens: Float[Tensor, "items members 64"],
+    pooled: Float[Tensor, "items 64"],
+) -> Float[Tensor, "items members 64"]:
+    """A residual block on ``[token, pooled]`` with the pooled half computed once per item."""
+    width = tokens.shape[-1]
+    inner, shortcut = block.inner, block.shortcut
+    shared = torch.addmm(inner.bias, pooled.relu(), inner.weight[:, width:].T)
+    hidden = (tokens.relu() @ inner.weight[:, :width].T).add_(shared[:, None]).relu_()
+    out = block.outer(hidden)
+    out += tokens @ shortcut.weight[:, :width].T
+    out += (pooled @ shortcut.weight[:, width:].T)[:, None]
+    return out

@@ -1,0 +1,134 @@
+"""Per-bone parts of a rig: which faces, which fixed surface points, which box.
+
+Labels by the largest skin weight. A part's points lie half on its own faces and half on its own
+and its neighbours' faces near them, so that the encoding of a part knows how it continues.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from handavatar.geometry.meshes import (
+    SurfacePoints,
+    distance_between_sets,
+    sample_surface_evenly,
+)
+from handavatar.geometry.rotations import apply_rigid, invert_rigid
+from handavatar.hand.pose import BONE_PARENTS, NUM_BONES
+from handavatar.hand.rig import PosedHand, Rig, RigError
+
+EXTENSION = 0.010
+"""How far a part's points reach into its neighbours, metres (as in the authors' code)."""
+
+
+@dataclass(frozen=True, eq=False)
+class PartBoxes:
+    """Axis-aligned boxes in the frames of the bones.
+
+    Attributes:
+        bone_from_world: rigid transforms.
+        lower: smallest corner of the part itself, metres, bone frame.
+        upper: largest corner.
+        margin: how far the part's occupancy reaches beyond its own box, metres.
+    """
+
+    bone_from_world: Float[Tensor, "bones 4 4"]
+    lower: Float[Tensor, "bones 3"]
+    upper: Float[Tensor, "bones 3"]
+    margin: float
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Fixed surface points and labels of every part of a rig.
+
+    Attributes:
+        vertex_labels: bone of each vertex, by largest skin weight.
+        corner_indices: face corners of the points of each part.
+        barycentric: weights of the corners.
+    """
+
+    vertex_labels: Int[Tensor, "vertices"]
+    corner_indices: Int[Tensor, "bones points 3"]
+    barycentric: Float[Tensor, "bones points 3"]
+
+    def to(self, device: torch.device | str) -> "Parts":
+        """The same parts on another device."""
+        return Parts(
+            self.vertex_labels.to(device),
+            self.corner_indices.to(device),
+            self.barycentric.to(device),
+        )
+
+    def point_clouds(self, posed: PosedHand) -> Float[Tensor, "bones points 6"]:
+        """Points and unit normals of each part in its own bone's frame (metres).
+
+        Source: paper Sec. 3.2, canonicalised point clouds and normals.
+        """
+        corners = posed.vertices[self.corner_indices]
+        points = (corners * self.barycentric[..., None]).sum(-2)
+        first, second, third = corners.unbind(-2)
+        normals = torch.linalg.cross(second - first, third - first)
+        normals = torch.nn.functional.normalize(normals, dim=-1, eps=1e-20)
+        bone_from_world = invert_rigid(posed.world_from_bone)
+        rotation = bone_from_world[:, :3, :3]
+        return torch.cat(
+            [apply_rigid(bone_from_world, points), normals @ rotation.transpose(-1, -2)], dim=-1
+        )
+
+    def boxes(self, posed: PosedHand, margin: float) -> PartBoxes:
+        """The box of each part's own vertices in its bone's frame, without gradient."""
+        with torch.no_grad():
+            bone_from_world = invert_rigid(posed.world_from_bone)
+            own = bone_from_world[self.vertex_labels]
+            local = (own[:, :3, :3] @ posed.vertices[..., None])[..., 0] + own[:, :3, 3]
+            index = self.vertex_labels[:, None].expand(-1, 3)
+            empty = local.new_full((NUM_BONES, 3), torch.inf)
+            lower = empty.scatter_reduce(0, index, local, "amin")
+            upper = (-empty).scatter_reduce(0, index, local, "amax")
+        return PartBoxes(bone_from_world, lower, upper, margin)
+
+
+def divide_into_parts(rig: Rig, points_per_part: int = 256, seed: int = 0) -> Parts:
+    """Labels a rig's vertices and fixes the surface points of every part.
+
+    Args:
+        rig: the rig; its template decides everything.
+        points_per_part: half of them on the part, half on the part and its surroundings.
+        seed: of the surface sampling.
+
+    Raises:
+        RigError: if a bone owns no face.
+
+    Source: paper Sec. 3.2 (N^p = 256 points per part, uniform).
+    Departs: the points are drawn once, evenly spread, and stay fixed, so that inference is
+        deterministic; the authors redraw them at every pass, also when they evaluate.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    vertices, faces = rig.template_vertices.cpu(), rig.faces.cpu()
+    labels = rig.skin_weights.cpu().argmax(-1)
+    face_labels = labels[faces].mode(-1).values
+    corner_indices, barycentric = [], []
+    for bone in range(NUM_BONES):
+        own = faces[face_labels == bone]
+        if len(own) == 0:
+            raise RigError(
+                f"rig {rig.name}: bone {bone} has the largest weight nowhere, so its part is "
+                "empty; check the skin weights"
+            )
+        family = [b for b in range(NUM_BONES) if BONE_PARENTS[b] == bone] + [bone]
+        if bone > 0:
+            family.append(BONE_PARENTS[bone])
+        candidates = faces[torch.isin(face_labels, torch.tensor(family))]
+        distance = distance_between_sets(vertices, vertices[own.unique()])
+        extended = candidates[(distance[candidates] < EXTENSION).all(-1)]
+        half = points_per_part // 2
+        clouds: list[SurfacePoints] = [
+            sample_surface_evenly(vertices, own, half, generator),
+            sample_surface_evenly(vertices, extended, points_per_part - half, generator),
+        ]
+        corner_indices.append(torch.cat([cloud.faces for cloud in clouds]))
+        barycentric.append(torch.cat([cloud.barycentric for cloud in clouds]))
+    return Parts(labels, torch.stack(corner_indices), torch.stack(barycentric))
