@@ -79,6 +79,7 @@ SOMA_TIPS = {
 }  # fmt: skip
 
 FLAT_SPLAY = 0.7  # fingers of the flat hand lie this much closer than in the rest mesh
+NAIL_IMPORTANCE = 6.0  # how much dearer a nail's vertices are when the mesh is thinned
 UV_MARGIN = 4 / 1024  # border left free around the UV island, so that textures can bleed
 
 
@@ -416,7 +417,8 @@ def fingertips(vertices: Floats, weights: Floats, axes: Floats, joints: Floats) 
         bone = first + 2
         candidates = np.flatnonzero(owner == bone)
         in_bone = (vertices[candidates] - joints[bone]) @ axes[bone].T
-        core = in_bone[in_bone[:, 2] > np.quantile(in_bone[:, 2], 0.5), :2].mean(axis=0)
+        end = in_bone[in_bone[:, 2] > np.quantile(in_bone[:, 2], 0.5), :2]
+        core = (end.min(axis=0) + end.max(axis=0)) / 2
         aside = np.linalg.norm(in_bone[:, :2] - core, axis=1)
         found.append(candidates[np.argmax(in_bone[:, 2] - 0.5 * aside)])
     return np.array(found)
@@ -433,8 +435,9 @@ class Thinning:
     which keeps the texture chart and the wrist's outline; the link condition keeps the topology.
     """
 
-    def __init__(self, surface: Surface) -> None:
+    def __init__(self, surface: Surface, importance: Floats) -> None:
         self.vertices = surface.vertices
+        self.importance = importance
         self.uv = surface.uv_coordinates
         self.faces = {
             number: list(face) for number, face in enumerate(surface.faces.tolist())
@@ -521,7 +524,7 @@ class Thinning:
             worst = min(worst, quality(after))
         length = np.linalg.norm(self.vertices[gone] - self.vertices[kept])
         unevenness = (length / self.scale) ** 2 * self.scale**4
-        return off_surface / worst + 2e-3 * unevenness / worst
+        return self.importance[gone] * (off_surface + 2e-3 * unevenness) / worst
 
     def _chart_upright(self, number: int, gone: int, kept: int) -> bool:
         wedge = self._wedges(gone, kept)
@@ -662,9 +665,14 @@ class Thinning:
         return new_faces.reshape(-1, 3), new_corners.reshape(-1, 3), kept, kept_uv
 
 
-def thinned(surface: Surface, num_vertices: int, num_rim_edges: int) -> tuple[Surface, Ints]:
-    """A coarser surface on a subset of the vertices, and which vertices those are."""
-    thinning = Thinning(surface)
+def thinned(
+    surface: Surface, importance: Floats, num_vertices: int, num_rim_edges: int
+) -> tuple[Surface, Ints]:
+    """A coarser surface on a subset of the vertices, and which vertices those are.
+
+    The importance of a vertex multiplies the cost of its leaving; if infinite, it stays.
+    """
+    thinning = Thinning(surface, importance)
     thinning.shrink_rim(num_rim_edges)
     thinning.shrink(num_vertices)
     for _ in range(10):
@@ -871,7 +879,9 @@ def build(folder: pathlib.Path) -> None:
         surface, weights, space.vertex_directions, regressor, axes, nails, tips
     )
 
-    thin, kept = thinned(surface, num_vertices=778, num_rim_edges=16)
+    importance = np.where(on_nail, NAIL_IMPORTANCE, 1.0)
+    importance[tips] = np.inf
+    thin, kept = thinned(surface, importance, num_vertices=778, num_rim_edges=16)
     thin_regressor = joint_regressor(
         thin.vertices, space.vertex_directions[kept], space.joints, space.joint_directions
     )
@@ -887,7 +897,7 @@ def build(folder: pathlib.Path) -> None:
         thin_regressor,
         axes,
         nails_by_finger(on_nail[kept], weights[kept]),
-        fingertips(thin.vertices, weights[kept], axes, space.joints),
+        np.searchsorted(kept, tips),
     )
     folder.mkdir(parents=True, exist_ok=True)
     digests = {

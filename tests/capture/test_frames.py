@@ -255,6 +255,7 @@ def test_a_truncated_picture_is_found_by_decoding_only(folder):
 def test_a_huge_header_is_refused_before_decoding(folder, side):
     header = b"IHDR" + struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)
     chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+    chunk += struct.pack(">I", 1000) + b"IDAT"
     (folder / "images/000001.png").write_bytes(b"\x89PNG\r\n\x1a\n" + chunk)
     with pytest.raises(CaptureError, match="megapixels"):
         read_capture(folder)

@@ -8,7 +8,7 @@ import av
 import numpy as np
 from jaxtyping import UInt8
 
-from handavatar.capture.frames import CaptureError
+from handavatar.capture.checks import CaptureError
 
 # FFmpeg's names of mp4, mov, mkv and webm. Nothing else is opened: playlists and image patterns
 # name other files or network addresses.
@@ -56,27 +56,28 @@ def video_frames(path: Path, fps: float = 10.0, max_frames: int = 600) -> Iterat
         except av.error.FFmpegError as error:
             raise CaptureError(
                 f"{path}: not a video that can be opened ({error.strerror}); expected a whole mp4, "
-                "mov, mkv or webm file: if it was copied or downloaded, do that again"
+                "mov, mkv or webm file",
+                "if it was copied or downloaded, do that again; else convert it to mp4",
             ) from error
         with container:
             if not container.streams.video:
                 raise CaptureError(
-                    f"{path}: holds no pictures, only {_stream_kinds(container)}; "
-                    "expected a video of a hand"
+                    f"{path}: holds no pictures, only {_stream_kinds(container)}",
+                    "give a video that shows a hand",
                 )
             yield from _decoded(path, container, fps, max_frames)
 
 
 def _check_file(path: Path) -> None:
     if not path.is_file():
-        raise CaptureError(f"{path}: no such file; expected a video (mp4, mov, mkv or webm)")
+        raise CaptureError(f"{path}: no such file", "give a video (mp4, mov, mkv or webm)")
     size = path.stat().st_size
     if size == 0:
-        raise CaptureError(f"{path}: the file is empty (0 bytes); copy or record the video again")
+        raise CaptureError(f"{path}: the file is empty (0 bytes)", "copy or record it again")
     if size > _MAX_BYTES:
         raise CaptureError(
-            f"{path}: {size / 2**30:.1f} GiB, at most {_MAX_BYTES / 2**30:.0f} are read; "
-            "cut the part that shows the hand"
+            f"{path}: {size / 2**30:.1f} GiB, at most {_MAX_BYTES / 2**30:.0f} are read",
+            "cut out the part that shows the hand",
         )
 
 
@@ -93,7 +94,8 @@ def _decoded(
     if not (_MIN_SIDE <= min(width, height) and width * height <= _MAX_PIXELS):
         raise CaptureError(
             f"{path}: pictures of {width} x {height} pixels; expected at least {_MIN_SIDE} on the "
-            f"short side and at most {_MAX_PIXELS // 1_000_000} megapixels"
+            f"short side and at most {_MAX_PIXELS // 1_000_000} megapixels",
+            "record or convert it at a common size such as 1280 x 720",
         )
     stream.thread_type = "AUTO"
     rate = float(stream.average_rate or 30)
@@ -115,12 +117,14 @@ def _decoded(
     expected = _expected_seconds(container, stream)
     decoded = time + 1 / rate if index >= 0 else 0.0
     if index < 0:
-        raise CaptureError(f"{path}: no picture could be decoded{problem}; record or copy it again")
+        raise CaptureError(
+            f"{path}: no picture could be decoded{problem}", "record or copy it again"
+        )
     if problem or (expected is not None and decoded < _WHOLE_SHARE * expected):
         promised = f" of {expected:.1f}" if expected is not None else ""
         raise CaptureError(
-            f"{path}: breaks off after {decoded:.1f}{promised} seconds{problem}: the file is cut "
-            "short; copy it again, or cut the good part out with a video editor"
+            f"{path}: breaks off after {decoded:.1f}{promised} seconds{problem}",
+            "the file is cut short: copy it again, or save the good part with a video editor",
         )
 
 

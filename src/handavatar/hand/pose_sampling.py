@@ -109,8 +109,9 @@ def clamped_angles(angles: Float[Tensor, "*batch bones 3"]) -> Float[Tensor, "*b
 
 def _limits_at(angles: Tensor) -> tuple[Tensor, Tensor]:
     """Least and greatest angles in radians, which for abduction depend on the flexion."""
-    least = torch.full((NUM_BONES, 3), -math.inf)
-    greatest = torch.full((NUM_BONES, 3), math.inf)
+    # No angle reaches a full turn, so the wrist stays free; infinity would spoil the gradient.
+    least = torch.full((NUM_BONES, 3), -2 * math.pi)
+    greatest = torch.full((NUM_BONES, 3), 2 * math.pi)
     for name, limits in JOINT_LIMITS.items():
         ranges = torch.tensor([limits.flexion, limits.abduction, limits.twist])
         least[BONE_NAMES.index(name)], greatest[BONE_NAMES.index(name)] = ranges.deg2rad().T
@@ -341,24 +342,23 @@ GESTURES: dict[str, Gesture] = {
     "relaxed": Gesture(
         (18, 25, 12, 2), (24, 32, 15, 0), (28, 36, 17, -1), (30, 36, 17, -3), (4, 6, -8, 10, 14)
     ),
-    "fist": Gesture(_FIST_INDEX, _FIST_MIDDLE, _FIST_RING, _FIST_LITTLE, (20, 18, -20, 35, 45)),
-    "point": Gesture(
-        (2, 3, 1, 0), _FIST_MIDDLE, _FIST_RING, _FIST_LITTLE, (20, 18, -20, 35, 40)
-    ),
+    "fist": Gesture(_FIST_INDEX, _FIST_MIDDLE, _FIST_RING, _FIST_LITTLE, (22, 14, -32, 28, 40)),
+    "point": Gesture((2, 3, 1, 0), _FIST_MIDDLE, _FIST_RING, _FIST_LITTLE, (29, 12, -38, 21, 30)),
     "pinch": Gesture(
-        (50, 45, 20, 0), (20, 25, 12, 0), (18, 22, 11, -2), (15, 20, 10, -5), (20, 15, -20, 10, 20)
+        (53, 47, 24, -3), (32, 34, 16, -1), (26, 30, 14, -2), (20, 26, 12, -6), (33, 9, -40, 4, -6)
     ),
     "ok": Gesture(
-        (55, 50, 25, 0), (5, 8, 3, 1), (0, 5, 2, -4), (-4, 3, 1, -12), (20, 15, -20, 10, 20)
+        (54, 46, 23, -1), (5, 8, 3, 2), (0, 5, 2, -5), (-4, 3, 1, -14), (32, 10, -40, 5, -6)
     ),
     "victory": Gesture(
-        (-2, 2, 1, 13), (-2, 2, 1, -8), _FIST_RING, _FIST_LITTLE, (25, 18, -25, 30, 40)
+        (-2, 2, 1, 13), (-2, 2, 1, -8), _FIST_RING, _FIST_LITTLE, (39, 13, -34, 28, 25)
     ),
     "thumbs_up": Gesture(
         _FIST_INDEX, _FIST_MIDDLE, _FIST_RING, _FIST_LITTLE, (-22, -8, 5, -8, -12)
     ),
+    # The one gesture in which fingers push each other beyond their own limits.
     "crossed_fingers": Gesture(
-        (20, 12, 6, -8), (6, 8, 4, 9), _FIST_RING, _FIST_LITTLE, (25, 18, -25, 30, 40)
+        (26, 14, 8, -15), (8, 8, 4, 15), _FIST_RING, _FIST_LITTLE, (39, 13, -34, 28, 25)
     ),
 }
 """Poses whose names everybody knows."""

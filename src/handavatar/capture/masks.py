@@ -1,0 +1,371 @@
+"""Which pixels show the hand: a colour model of this video, then graph cuts.
+
+Two Gaussian mixtures in OKLab, one of skin and one of everything else, are learned from some
+thirty frames around the tracked landmarks. Their log-likelihood ratio starts GrabCut in every
+frame. The result holds the forearm as well; where the hand ends is decided by the fitted rig.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image, ImageDraw
+from scipy import ndimage
+
+from handavatar.capture.checks import CaptureError
+from handavatar.capture.tracking import TrackedHand, Window
+
+_FINGER_CHAINS = ((0, 1, 2, 3, 4), (5, 6, 7, 8), (9, 10, 11, 12), (13, 14, 15, 16), (17, 18, 19, 20))
+_PALM = (0, 1, 2, 5, 9, 13, 17)
+_CORE_RADIUS = 0.004
+_HAND_RADIUS = 0.022
+_BACKGROUND_MARGIN = 0.030
+_FOREARM_HALF_ANGLE = 50.0
+_HOLE_RADIUS = 0.004
+_CUT_ROUNDS = 2
+
+_LMS_FROM_RGB = np.array(
+    [
+        [0.4122214708, 0.5363325363, 0.0514459929],
+        [0.2119034982, 0.6806995451, 0.1073969566],
+        [0.0883024619, 0.2817188376, 0.6299787005],
+    ]
+)
+_OKLAB_FROM_LMS = np.array(
+    [
+        [0.2104542553, 0.7936177850, -0.0040720468],
+        [1.9779984951, -2.4285922050, 0.4505937099],
+        [0.0259040371, 0.7827717662, -0.8086757660],
+    ]
+)
+
+
+def oklab_from_srgb(image: UInt8[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Perceptual colour (lightness, green-red, blue-yellow) of 8-bit sRGB."""
+    steps = np.arange(256) / 255
+    linear = np.where(steps <= 0.04045, steps / 12.92, ((steps + 0.055) / 1.055) ** 2.4)
+    return np.cbrt(linear[image] @ _LMS_FROM_RGB.T) @ _OKLAB_FROM_LMS.T
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianMixture:
+    """A density of colours.
+
+    Attributes:
+        weights: sum to 1.
+        means: OKLab.
+        precisions: inverse covariances.
+    """
+
+    weights: Float[np.ndarray, "parts"]
+    means: Float[np.ndarray, "parts 3"]
+    precisions: Float[np.ndarray, "parts 3 3"]
+
+    def log_density(self, colors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+        """Natural logarithm of the density."""
+        return np.logaddexp.reduce(self._log_parts(colors), axis=-1)
+
+    def _log_parts(self, colors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n parts"]:
+        parts = []
+        for weight, mean, precision in zip(
+            self.weights, self.means, self.precisions, strict=True
+        ):
+            apart = colors - mean
+            mahalanobis = ((apart @ precision) * apart).sum(-1)
+            norm = 0.5 * np.linalg.slogdet(precision)[1] - 1.5 * np.log(2 * np.pi)
+            parts.append(np.log(weight + 1e-12) + norm - 0.5 * mahalanobis)
+        return np.stack(parts, axis=-1)
+
+
+def fit_mixture(
+    colors: Float[np.ndarray, "n 3"],
+    num_parts: int,
+    generator: np.random.Generator,
+    rounds: int = 25,
+) -> GaussianMixture:
+    """Expectation maximisation from well separated starting points.
+
+    Args:
+        colors: at least a few dozen.
+        num_parts: Gaussians of the mixture.
+        generator: chooses the first starting point.
+        rounds: of expectation and maximisation.
+    """
+    # Sensor noise and the 8-bit steps of dark colours: no Gaussian gets narrower than this.
+    floor = np.eye(3) * 0.006**2
+    means = [colors[generator.integers(len(colors))]]
+    for _ in range(num_parts - 1):
+        nearest = np.min([((colors - mean) ** 2).sum(-1) for mean in means], axis=0)
+        means.append(colors[generator.choice(len(colors), p=nearest / nearest.sum())])
+    spread = np.cov(colors.T) / num_parts + floor
+    mixture = GaussianMixture(
+        np.full(num_parts, 1 / num_parts),
+        np.array(means),
+        np.repeat(np.linalg.inv(spread)[None], num_parts, axis=0),
+    )
+    for _ in range(rounds):
+        logs = mixture._log_parts(colors)
+        shares = np.exp(logs - np.logaddexp.reduce(logs, axis=-1)[:, None])
+        totals = shares.sum(0) + 1e-6
+        centers = (shares.T @ colors) / totals[:, None]
+        covariances = []
+        for share, total, center in zip(shares.T, totals, centers, strict=True):
+            apart = colors - center
+            covariances.append((share[:, None] * apart).T @ apart / total + floor)
+        mixture = GaussianMixture(
+            totals / totals.sum(), centers, np.linalg.inv(np.array(covariances))
+        )
+    return mixture
+
+
+@dataclass(frozen=True, eq=False)
+class ColorModel:
+    """Skin against everything else, in one video.
+
+    Attributes:
+        hand: colours on the hand.
+        background: colours away from it.
+    """
+
+    hand: GaussianMixture
+    background: GaussianMixture
+
+    def log_ratio(
+        self, image: UInt8[np.ndarray, "height width 3"]
+    ) -> Float[np.ndarray, "height width"]:
+        """How much likelier each pixel is to be hand: natural logarithm, within +-12.
+
+        Colours are looked up on a grid of 64 steps per channel.
+        """
+        coarse = image >> 2
+        keys = (
+            (coarse[..., 0].astype(np.int32) << 12)
+            | (coarse[..., 1].astype(np.int32) << 6)
+            | coarse[..., 2]
+        )
+        used, where = np.unique(keys, return_inverse=True)
+        colors = np.stack([used >> 12, (used >> 6) & 63, used & 63], axis=-1) * 4 + 2
+        colors = oklab_from_srgb(colors.astype(np.uint8))
+        return np.clip(self.ratio_of(colors), -12, 12)[where].reshape(keys.shape)
+
+    def ratio_of(self, colors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """The same of OKLab colours, exact and without bounds."""
+        return self.hand.log_density(colors) - self.background.log_density(colors)
+
+
+@dataclass(frozen=True, eq=False)
+class HandMask:
+    """The hand and forearm in a window.
+
+    Attributes:
+        pixels: true on skin that belongs to the hand or the forearm.
+        quality: agreement (intersection over union) of the graph cut with the colour model
+            alone, in [0, 1].
+    """
+
+    pixels: Bool[np.ndarray, "side side"]
+    quality: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Regions:
+    """What the landmarks say of a window, before any colour."""
+
+    core: Bool[np.ndarray, "side side"]
+    near: Bool[np.ndarray, "side side"]
+    forearm: Bool[np.ndarray, "side side"]
+    far: Bool[np.ndarray, "side side"]
+    pixels_per_metre: float
+
+
+def learn_colors(hands: Sequence[TrackedHand], seed: int = 0, num_frames: int = 30) -> ColorModel:
+    """Two mixtures from the surest frames of a video, spread over its length.
+
+    Raises:
+        CaptureError: the landmarks leave no background to learn from.
+    """
+    generator = np.random.default_rng(seed)
+    chosen = _sure_and_spread(hands, num_frames)
+    inside, outside = [], []
+    for hand in chosen:
+        regions = _regions(hand)
+        image = hand.window.image
+        for colors, region in ((inside, regions.core), (outside, regions.far)):
+            pixels = image[region]
+            if len(pixels):
+                colors.append(generator.choice(pixels, min(len(pixels), 1500), axis=0))
+    if not inside or not outside:
+        raise CaptureError("the hand fills the picture", "record it with room on every side")
+    hand_colors = oklab_from_srgb(np.concatenate(inside))
+    other_colors = oklab_from_srgb(np.concatenate(outside))
+    for _ in range(2):
+        model = ColorModel(
+            fit_mixture(hand_colors, 5, generator), fit_mixture(other_colors, 6, generator)
+        )
+        # Landmarks beside the finger put background among the seeds, an unseen second patch of
+        # skin puts skin among the background: what contradicts the first model is left out.
+        hand_colors = hand_colors[model.ratio_of(hand_colors) > -1]
+        other_colors = other_colors[model.ratio_of(other_colors) < 3]
+        if len(hand_colors) < 500 or len(other_colors) < 500:
+            break
+    return model
+
+
+def find_mask(hand: TrackedHand, colors: ColorModel) -> HandMask:
+    """The hand and forearm in one frame's window: colour model, then GrabCut.
+
+    Raises:
+        CaptureError: OpenCV is not installed.
+    """
+    regions = _regions(hand)
+    ratio = ndimage.gaussian_filter(colors.log_ratio(hand.window.image), 1.0)
+    allowed = regions.near | regions.forearm
+    by_color = (ratio > 0) & allowed
+    labels = np.full(ratio.shape, _BACKGROUND, dtype=np.uint8)
+    labels[allowed] = _LIKELY_BACKGROUND
+    labels[by_color] = _LIKELY_HAND
+    labels[regions.core & (ratio > 2)] = _HAND
+    cut = _graph_cut(hand.window.image, labels)
+    cleaned = _cleaned(cut, regions)
+    reference = _cleaned(by_color, regions)
+    union = (cleaned | reference) & regions.near
+    agreement = (cleaned & reference & regions.near).sum() / max(1, int(union.sum()))
+    return HandMask(cleaned, float(agreement))
+
+
+def pixels_per_metre(hand: TrackedHand) -> float:
+    """Scale of a tracked hand: picture pixels per metre at its depth."""
+    pairs = [(a, b) for chain in _FINGER_CHAINS for a, b in zip(chain[:-1], chain[1:], strict=True)]
+    pairs += [(0, 5), (0, 9), (0, 13), (0, 17)]
+    first, second = np.array(pairs).T
+    picture = np.linalg.norm(hand.landmarks[first] - hand.landmarks[second], axis=-1)
+    world = hand.world_landmarks[first] - hand.world_landmarks[second]
+    flat = np.linalg.norm(world[:, :2], axis=-1)
+    return float(picture.sum() / max(1e-6, flat.sum()))
+
+
+# GrabCut's labels.
+_BACKGROUND, _HAND, _LIKELY_BACKGROUND, _LIKELY_HAND = 0, 1, 2, 3
+
+
+def _graph_cut(
+    image: UInt8[np.ndarray, "side side 3"], labels: UInt8[np.ndarray, "side side"]
+) -> Bool[np.ndarray, "side side"]:
+    try:
+        import cv2
+    except ImportError as error:
+        raise CaptureError(
+            f"OpenCV cannot be loaded ({error})", "pip install 'handavatar[video]'"
+        ) from error
+    if not (labels & 1).any() or (labels & 1).all():
+        return (labels & 1).astype(bool)
+    labels = labels.copy()
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.setRNGSeed(0)
+    cv2.grabCut(
+        np.ascontiguousarray(image), labels, None, *models, _CUT_ROUNDS, cv2.GC_INIT_WITH_MASK
+    )
+    return (labels & 1).astype(bool)
+
+
+def _cleaned(
+    mask: Bool[np.ndarray, "side side"], regions: _Regions
+) -> Bool[np.ndarray, "side side"]:
+    """The piece with the palm, without specks and pinholes."""
+    radius = max(1.0, 0.001 * regions.pixels_per_metre)
+    mask = _within(~_within(~mask, radius), radius)
+    pieces, count = ndimage.label(mask)
+    if count == 0:
+        return mask
+    overlap = np.bincount(pieces[regions.core], minlength=count + 1)[1:]
+    mask = pieces == 1 + int(overlap.argmax())
+    holes, count = ndimage.label(~mask)
+    areas = np.bincount(holes.ravel(), minlength=count + 1)
+    limit = np.pi * (_HOLE_RADIUS * regions.pixels_per_metre) ** 2
+    is_small = areas < limit
+    is_small[0] = False
+    return mask | is_small[holes]
+
+
+def _within(
+    mask: Bool[np.ndarray, "side side"], radius: float
+) -> Bool[np.ndarray, "side side"]:
+    """All pixels at most ``radius`` pixels from the mask."""
+    if not mask.any():
+        return mask
+    return ndimage.distance_transform_edt(~mask) <= radius
+
+
+def _sure_and_spread(hands: Sequence[TrackedHand], count: int) -> list[TrackedHand]:
+    """From each of ``count`` stretches of time, the frame whose landmarks agree best."""
+    stretches = np.array_split(np.arange(len(hands)), min(count, len(hands)))
+    return [
+        hands[min(stretch, key=lambda i: float(hands[i].spread.mean()))] for stretch in stretches
+    ]
+
+
+def _regions(hand: TrackedHand) -> _Regions:
+    scale = pixels_per_metre(hand) * hand.window.scale
+    points = hand.window.from_picture(hand.landmarks)
+    side = hand.window.image.shape[0]
+    bones = _drawn_bones(points, side, _CORE_RADIUS * scale)
+    palm = _drawn_polygon(points[list(_PALM)], side)
+    inner_palm = ~_within(~palm, 0.008 * scale)
+    forearm = _forearm(points, side)
+    covered = bones | palm
+    distance = ndimage.distance_transform_edt(~covered)
+    return _Regions(
+        core=bones | inner_palm,
+        near=distance < _HAND_RADIUS * scale,
+        forearm=forearm,
+        far=(distance > _BACKGROUND_MARGIN * scale)
+        & ~_within(forearm, 0.01 * scale)
+        & _inside_picture(hand.window),
+        pixels_per_metre=scale,
+    )
+
+
+def _inside_picture(window: Window) -> Bool[np.ndarray, "side side"]:
+    side = window.image.shape[0]
+    centers = (np.arange(side) + 0.5) / window.scale
+    x, y = centers + window.corner[0], centers + window.corner[1]
+    width, height = window.picture_size
+    return ((y > 0) & (y < height))[:, None] & ((x > 0) & (x < width))[None, :]
+
+
+def _drawn_bones(
+    points: Float[np.ndarray, "21 2"], side: int, radius: float
+) -> Bool[np.ndarray, "side side"]:
+    canvas = Image.new("1", (side, side))
+    draw = ImageDraw.Draw(canvas)
+    for chain in _FINGER_CHAINS:
+        line = [(float(x), float(y)) for x, y in points[list(chain)]]
+        draw.line(line, fill=1, width=max(1, round(2 * radius)))
+        for x, y in line:
+            draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=1)
+    return np.asarray(canvas)
+
+
+def _drawn_polygon(
+    points: Float[np.ndarray, "corners 2"], side: int
+) -> Bool[np.ndarray, "side side"]:
+    canvas = Image.new("1", (side, side))
+    ImageDraw.Draw(canvas).polygon([(float(x), float(y)) for x, y in points], fill=1)
+    return np.asarray(canvas)
+
+
+def _forearm(points: Float[np.ndarray, "21 2"], side: int) -> Bool[np.ndarray, "side side"]:
+    """Where the forearm may lie: a wide cone behind the wrist, away from the knuckles."""
+    knuckles = points[[5, 9, 13, 17]].mean(0)
+    away = points[0] - knuckles
+    length = float(np.linalg.norm(away))
+    away = away / max(length, 1e-6)
+    # The apex lies inside the hand, so that the cone is already wrist-wide at the wrist.
+    apex = points[0] - 0.5 * length * away
+    y, x = np.mgrid[:side, :side] + 0.5
+    dx, dy = x - apex[0], y - apex[1]
+    along = dx * away[0] + dy * away[1]
+    distance = np.hypot(dx, dy)
+    cone = along > np.cos(np.radians(_FOREARM_HALF_ANGLE)) * distance
+    return cone & (along > 0.3 * length)

@@ -1,0 +1,410 @@
+"""Finding the hand: 21 landmarks per picture, by MediaPipe 0.10.14 (the ``video`` extra).
+
+Three looks at every picture are combined: the tracker's own, and two at a crop around it turned
+by 35 degrees either way. Their median is steadier than any one of them, and where they disagree
+(a fist, a hand seen edge-on) the landmarks are not to be trusted.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from handavatar.capture.checks import CaptureError
+from handavatar.capture.decoding import VideoFrame
+
+NUM_LANDMARKS = 21
+LANDMARK_NAMES: tuple[str, ...] = (
+    "wrist",
+    *(f"thumb_{part}" for part in ("cmc", "mcp", "ip", "tip")),
+    *(
+        f"{finger}_{part}"
+        for finger in ("index", "middle", "ring", "little")
+        for part in ("mcp", "pip", "dip", "tip")
+    ),
+)
+_TURNS = (math.radians(35), math.radians(-35))
+_VIEW_SIDE = 448
+_VIEW_SCALE = 2.0
+_WINDOW_SCALE = 1.9
+_MAX_WINDOW_SIDE = 576
+_MAX_SHARE_OF_TWO_HANDS = 0.1
+_MIN_FRAMES = 8
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """A square piece of a picture, resampled.
+
+    A point of the picture lies in the window at ``(point - corner) * scale``, both in pixels
+    counted from the corner of the first pixel. Beyond the picture its border is repeated.
+
+    Attributes:
+        image: sRGB.
+        corner: upper left corner (x, y) in the picture.
+        scale: window pixels per picture pixel.
+        picture_size: width and height of the whole picture, pixels.
+    """
+
+    image: UInt8[np.ndarray, "side side 3"]
+    corner: tuple[float, float]
+    scale: float
+    picture_size: tuple[int, int]
+
+    def from_picture(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+        """Picture points in window pixels."""
+        return (points - np.array(self.corner)) * self.scale
+
+    def mirrored(self) -> "Window":
+        """The window of the mirrored picture."""
+        side = self.image.shape[0] / self.scale
+        return replace(
+            self,
+            image=np.ascontiguousarray(self.image[:, ::-1]),
+            corner=(self.picture_size[0] - self.corner[0] - side, self.corner[1]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """One hand as one look at a picture found it.
+
+    Attributes:
+        landmarks: in the order of ``LANDMARK_NAMES``, pixels of the picture.
+        world_landmarks: metres about the hand's centre, camera axes.
+        presence: the tracker's certainty, in [0, 1].
+        is_right: of a person's right hand, in a picture that is not mirrored.
+    """
+
+    landmarks: Float[np.ndarray, "21 2"]
+    world_landmarks: Float[np.ndarray, "21 3"]
+    presence: float
+    is_right: bool
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedHand:
+    """The hand in one picture of the video; after tracking always a right one.
+
+    Attributes:
+        index: number of the frame in the file.
+        time: seconds from the start.
+        window: the surroundings of the hand.
+        landmarks: pixels of the whole (possibly mirrored) picture.
+        spread: disagreement of the looks per landmark, pixels.
+        world_landmarks: metres about the hand's centre, camera axes.
+        presence: the tracker's certainty, in [0, 1].
+    """
+
+    index: int
+    time: float
+    window: Window
+    landmarks: Float[np.ndarray, "21 2"]
+    spread: Float[np.ndarray, "21"]
+    world_landmarks: Float[np.ndarray, "21 3"]
+    presence: float
+
+    def mirrored(self) -> "TrackedHand":
+        """The same hand in the mirrored picture."""
+        flip = np.array([-1.0, 1.0])
+        shift = np.array([self.window.picture_size[0], 0.0])
+        return replace(
+            self,
+            window=self.window.mirrored(),
+            landmarks=self.landmarks * flip + shift,
+            world_landmarks=self.world_landmarks * np.array([-1.0, 1.0, 1.0]),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One hand through a video.
+
+    Attributes:
+        side: ``left`` if the pictures were mirrored to show a right hand.
+        hands: the frames in which it was found.
+        skipped: frame index to the reason, for the others.
+        picture_size: width and height of the pictures.
+    """
+
+    side: str
+    hands: tuple[TrackedHand, ...]
+    skipped: dict[int, str]
+    picture_size: tuple[int, int]
+
+
+class HandFinder:
+    """MediaPipe's hand models, opened once; a context manager."""
+
+    def __init__(self) -> None:
+        """Opens the models that ship in the mediapipe wheel.
+
+        Raises:
+            CaptureError: mediapipe is not installed, or has no hand models.
+        """
+        hands = _mediapipe_hands()
+        self._tracker = hands(
+            static_image_mode=False,
+            max_num_hands=2,
+            model_complexity=1,
+            min_detection_confidence=0.5,
+            min_tracking_confidence=0.5,
+        )
+        self._still = hands(
+            static_image_mode=True,
+            max_num_hands=2,
+            model_complexity=1,
+            min_detection_confidence=0.3,
+        )
+
+    def __enter__(self) -> "HandFinder":
+        """Itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Closes both graphs."""
+        self._tracker.close()
+        self._still.close()
+
+    def track(self, image: UInt8[np.ndarray, "height width 3"]) -> list[Sighting]:
+        """All hands of the next picture of a video."""
+        return _without_doubles(_sightings(self._tracker, image))
+
+    def look_closely(
+        self,
+        image: UInt8[np.ndarray, "height width 3"],
+        around: Float[np.ndarray, "21 2"],
+        turn: float,
+    ) -> Sighting | None:
+        """The hand near given landmarks, looked for in a turned and enlarged crop.
+
+        Args:
+            image: the whole picture.
+            around: landmarks of about the right place and size, pixels.
+            turn: radians by which the crop is turned.
+        """
+        low, high = around.min(0), around.max(0)
+        center, side = (low + high) / 2, float((high - low).max()) * _VIEW_SCALE
+        cos, sin = math.cos(turn), math.sin(turn)
+        picture_from_view = np.array([[cos, -sin], [sin, cos]]) * (side / _VIEW_SIDE)
+        corner = center - picture_from_view @ np.array([_VIEW_SIDE / 2, _VIEW_SIDE / 2])
+        view = resampled(image, picture_from_view, corner, _VIEW_SIDE)
+        found = [
+            _turned(sighting, picture_from_view, corner)
+            for sighting in _sightings(self._still, view)
+        ]
+        return min(found, key=lambda s: _distance(s.landmarks, around), default=None)
+
+
+def track_hand(
+    frames: Iterable[VideoFrame],
+    side: str = "auto",
+    progress: Callable[[int, str], None] | None = None,
+) -> Track:
+    """Follows the one hand of a video.
+
+    Args:
+        frames: upright pictures in the order of time.
+        side: ``left`` or ``right`` to overrule the tracker, which takes the video as not mirrored.
+        progress: called with the number of frames done and a word.
+
+    Raises:
+        CaptureError: no hand, two hands in more than a tenth of the pictures, or mediapipe missing.
+    """
+    hands: list[TrackedHand] = []
+    is_right: list[float] = []
+    skipped: dict[int, str] = {}
+    last: Float[np.ndarray, "21 2"] | None = None
+    picture_size = (0, 0)
+    with HandFinder() as finder:
+        for count, frame in enumerate(frames):
+            picture_size = (frame.image.shape[1], frame.image.shape[0])
+            found = finder.track(frame.image)
+            if not found and last is not None:
+                again = finder.look_closely(frame.image, last, 0.0)
+                found = [again] if again is not None else []
+            if len(found) == 1:
+                hand = _combined(finder, frame, found[0])
+                hands.append(hand)
+                is_right.append(found[0].presence if found[0].is_right else -found[0].presence)
+                last = hand.landmarks
+            else:
+                skipped[frame.index] = "two hands" if found else "no hand found"
+            if progress is not None:
+                progress(count + 1, "tracking")
+    _check_found(hands, skipped)
+    if side == "auto":
+        side = "right" if sum(is_right) >= 0 else "left"
+    if side == "left":
+        hands = [hand.mirrored() for hand in hands]
+    return Track(side, tuple(hands), skipped, picture_size)
+
+
+def resampled(
+    image: UInt8[np.ndarray, "height width 3"],
+    picture_from_view: Float[np.ndarray, "2 2"],
+    corner: Float[np.ndarray, "2"],
+    side: int,
+) -> UInt8[np.ndarray, "side side 3"]:
+    """A square view of a picture; its border is repeated outside. Blurred first where it shrinks.
+
+    Args:
+        image: any picture.
+        picture_from_view: turns and scales view pixels to picture pixels.
+        corner: the view's upper left corner, picture pixels.
+        side: of the view, pixels.
+    """
+    low = np.floor(np.min(_view_corners(picture_from_view, corner, side), axis=0)).astype(int) - 2
+    high = np.ceil(np.max(_view_corners(picture_from_view, corner, side), axis=0)).astype(int) + 2
+    rows = np.clip(np.arange(low[1], high[1]), 0, image.shape[0] - 1)
+    columns = np.clip(np.arange(low[0], high[0]), 0, image.shape[1] - 1)
+    piece = Image.fromarray(image[rows[:, None], columns[None, :]])
+    shrink = math.sqrt(abs(float(np.linalg.det(picture_from_view))))
+    factor = max(1, round(shrink))
+    if factor > 1:
+        piece = piece.reduce(factor)
+    matrix = picture_from_view / factor
+    shift = (corner - low) / factor
+    coefficients = (*matrix[0], shift[0], *matrix[1], shift[1])
+    view = piece.transform(
+        (side, side), Image.Transform.AFFINE, coefficients, Image.Resampling.BILINEAR
+    )
+    return np.asarray(view)
+
+
+def _view_corners(
+    picture_from_view: Float[np.ndarray, "2 2"], corner: Float[np.ndarray, "2"], side: int
+) -> Float[np.ndarray, "4 2"]:
+    square = np.array([[0, 0], [side, 0], [0, side], [side, side]], dtype=float)
+    return square @ picture_from_view.T + corner
+
+
+def window_around(
+    image: UInt8[np.ndarray, "height width 3"], landmarks: Float[np.ndarray, "21 2"]
+) -> Window:
+    """The surroundings of a hand: room for the wrist and for its errors on every side."""
+    low, high = landmarks.min(0), landmarks.max(0)
+    side = float((high - low).max()) * _WINDOW_SCALE
+    pixels = int(min(_MAX_WINDOW_SIDE, max(128, round(side))))
+    corner = (low + high) / 2 - side / 2
+    picture_from_view = np.eye(2) * (side / pixels)
+    return Window(
+        resampled(image, picture_from_view, corner, pixels),
+        (float(corner[0]), float(corner[1])),
+        pixels / side,
+        (image.shape[1], image.shape[0]),
+    )
+
+
+def _combined(finder: HandFinder, frame: VideoFrame, first: Sighting) -> TrackedHand:
+    """The median of several looks at a picture, and how far they disagree."""
+    looks = [first]
+    for turn in _TURNS:
+        look = finder.look_closely(frame.image, first.landmarks, turn)
+        if look is not None and look.is_right == first.is_right:
+            looks.append(look)
+    landmarks = np.stack([look.landmarks for look in looks])
+    middle = np.median(landmarks, axis=0)
+    size = float(np.ptp(middle, axis=0).max())
+    # A hand that only one look has found is as uncertain as a tenth of its size.
+    unsure = 0.1 * size if len(looks) == 1 else 0.0
+    spread = np.linalg.norm(landmarks - middle, axis=-1).max(0) + unsure
+    return TrackedHand(
+        index=frame.index,
+        time=frame.time,
+        window=window_around(frame.image, middle),
+        landmarks=middle,
+        spread=spread,
+        world_landmarks=np.median(np.stack([look.world_landmarks for look in looks]), axis=0),
+        presence=float(np.mean([look.presence for look in looks])),
+    )
+
+
+def _check_found(hands: Sequence[TrackedHand], skipped: dict[int, str]) -> None:
+    total = len(hands) + len(skipped)
+    num_double = sum(reason == "two hands" for reason in skipped.values())
+    if num_double > _MAX_SHARE_OF_TWO_HANDS * total:
+        raise CaptureError(
+            f"two hands in {num_double} of {total} pictures; expected one",
+            "record one hand alone, or crop the video to it",
+        )
+    if len(hands) < _MIN_FRAMES:
+        raise CaptureError(
+            f"a hand was found in {len(hands)} of {total} pictures; at least {_MIN_FRAMES} "
+            "are needed",
+            "record one bare hand, whole and well lit, larger than a sixth of the picture",
+        )
+
+
+def _mediapipe_hands() -> Any:
+    try:
+        from mediapipe.python.solutions.hands import Hands
+    except ImportError as error:
+        raise CaptureError(
+            f"the hand tracker cannot be loaded ({error})",
+            "pip install 'handavatar[video]' (mediapipe 0.10.14: newer ones have no hand models)",
+        ) from error
+    return Hands
+
+
+def _sightings(graph: Any, image: UInt8[np.ndarray, "height width 3"]) -> list[Sighting]:
+    result = graph.process(np.ascontiguousarray(image))
+    if not result.multi_hand_landmarks:
+        return []
+    size = np.array([image.shape[1], image.shape[0]])
+    found = []
+    for landmarks, world, hand in zip(
+        result.multi_hand_landmarks,
+        result.multi_hand_world_landmarks,
+        result.multi_handedness,
+        strict=True,
+    ):
+        label = hand.classification[0]
+        found.append(
+            Sighting(
+                np.array([[p.x, p.y] for p in landmarks.landmark]) * size,
+                np.array([[p.x, p.y, p.z] for p in world.landmark]),
+                float(label.score),
+                # The legacy interface takes every picture for a mirrored selfie.
+                label.label == "Left",
+            )
+        )
+    return found
+
+
+def _turned(
+    sighting: Sighting,
+    picture_from_view: Float[np.ndarray, "2 2"],
+    corner: Float[np.ndarray, "2"],
+) -> Sighting:
+    """A sighting in a view, in the picture's pixels and axes."""
+    rotation = picture_from_view / math.sqrt(abs(float(np.linalg.det(picture_from_view))))
+    world = sighting.world_landmarks.copy()
+    world[:, :2] = world[:, :2] @ rotation.T
+    landmarks = sighting.landmarks @ picture_from_view.T + corner
+    return replace(sighting, landmarks=landmarks, world_landmarks=world)
+
+
+def _without_doubles(sightings: list[Sighting]) -> list[Sighting]:
+    """Drops the fainter of two sightings of the same hand."""
+    kept: list[Sighting] = []
+    for sighting in sorted(sightings, key=lambda s: -s.presence):
+        size = float(np.ptp(sighting.landmarks, axis=0).max())
+        if all(_distance(sighting.landmarks, other.landmarks) > 0.4 * size for other in kept):
+            kept.append(sighting)
+    return kept
+
+
+def _distance(first: Float[np.ndarray, "21 2"], second: Float[np.ndarray, "21 2"]) -> float:
+    """Mean distance of landmarks, pixels."""
+    return float(np.linalg.norm(first - second, axis=-1).mean())

@@ -1,0 +1,307 @@
+"""What a rendered hand is measured by.
+
+Images are display values (sRGB) in [0, 1] with channels last. All protocols put both pictures on
+black and round them to 8 bit first, as a file on disk would hold them.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+PSNR_CEILING = 100.0
+"""Decibels given to equal pictures, whose ratio is infinite: means stay finite, JSON valid."""
+
+REGION_MARGIN = 8.0
+"""Pixels around both masks that the masked protocol judges too."""
+
+_WINDOW_SIGMA = 1.5
+_WINDOW_RADIUS = 5
+_LUMINANCE_CONSTANT = 0.01**2
+_CONTRAST_CONSTANT = 0.03**2
+
+
+def psnr(
+    rendered: Float[Tensor, "*pixels channels"], truth: Float[Tensor, "*pixels channels"]
+) -> float:
+    """Peak signal-to-noise ratio in decibels for a peak of 1; for a region, index both alike.
+
+    Source: paper Sec. 4.1, PSNR.
+    """
+    error = float((rendered.double() - truth.double()).square().mean())
+    return min(-10 * math.log10(error), PSNR_CEILING) if error > 0 else PSNR_CEILING
+
+
+def ssim_map(
+    rendered: Float[Tensor, "height width channels"], truth: Float[Tensor, "height width channels"]
+) -> Float[Tensor, "inner_height inner_width"]:
+    """Structural similarity around each pixel whose 11 x 11 window fits in the image.
+
+    Gaussian window of 1.5 pixels, population covariance, mean over the channels. The map is 10
+    pixels smaller than the image, in both directions. Differentiable.
+
+    Raises:
+        ValueError: if the image is smaller than the window.
+
+    Source: paper Sec. 4.1, SSIM (Wang et al. 2004); window and borders as in the authors' code.
+    """
+    smallest = 2 * _WINDOW_RADIUS + 1
+    if min(rendered.shape[:2]) < smallest:
+        raise ValueError(
+            f"SSIM needs an image of at least {smallest} x {smallest} pixels, "
+            f"found {rendered.shape[1]} x {rendered.shape[0]}"
+        )
+    a, b = rendered.movedim(-1, 0), truth.movedim(-1, 0)
+    mean_a, mean_b, square_a, square_b, product = (
+        _window_mean(value) for value in (a, b, a * a, b * b, a * b)
+    )
+    variances = square_a - mean_a.square() + square_b - mean_b.square()
+    covariance = product - mean_a * mean_b
+    luminance = (2 * mean_a * mean_b + _LUMINANCE_CONSTANT) / (
+        mean_a.square() + mean_b.square() + _LUMINANCE_CONSTANT
+    )
+    structure = (2 * covariance + _CONTRAST_CONSTANT) / (variances + _CONTRAST_CONSTANT)
+    return (luminance * structure).mean(0)
+
+
+def ssim(
+    rendered: Float[Tensor, "height width channels"], truth: Float[Tensor, "height width channels"]
+) -> Float[Tensor, ""]:
+    """Mean of :func:`ssim_map`."""
+    return ssim_map(rendered, truth).mean()
+
+
+def mask_iou(first: Bool[Tensor, "*pixels"], second: Bool[Tensor, "*pixels"]) -> float:
+    """Intersection over union of two masks; 1 if both are empty."""
+    union = int((first | second).sum())
+    return int((first & second).sum()) / union if union else 1.0
+
+
+def dilated(mask: Bool[Tensor, "height width"], radius: float) -> Bool[Tensor, "height width"]:
+    """All pixels within the radius (pixels, Euclidean) of the mask."""
+    if not bool(mask.any()):
+        return mask
+    distance = distance_transform_edt(~mask.cpu().numpy())
+    return torch.from_numpy(distance <= radius).to(mask.device)
+
+
+def quantised(image: Float[Tensor, "*pixels channels"]) -> Float[Tensor, "*pixels channels"]:
+    """The nearest 8-bit values, still in [0, 1].
+
+    Departs: the authors' code truncates, which darkens by half a level; files are rounded.
+    """
+    return (image.clamp(0, 1) * 255).round() / 255
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedFrame:
+    """A picture of the avatar beside the photograph of the same moment.
+
+    Attributes:
+        rendered: the avatar on black.
+        rendered_mask: where the avatar covers at least half of the pixel.
+        truth: the photograph; its background is ignored.
+        truth_mask: where the photograph shows the hand.
+    """
+
+    rendered: Float[Tensor, "height width 3"]
+    rendered_mask: Bool[Tensor, "height width"]
+    truth: Float[Tensor, "height width 3"]
+    truth_mask: Bool[Tensor, "height width"]
+
+    def on_black(self) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
+        """Both pictures as they are compared: the hand on black, 8 bit."""
+        return quantised(self.rendered), quantised(self.truth * self.truth_mask[..., None])
+
+    def region(self) -> Bool[Tensor, "height width"]:
+        """The union of both masks, dilated by ``REGION_MARGIN``.
+
+        Raises:
+            ValueError: if neither picture shows a hand.
+        """
+        union = self.rendered_mask | self.truth_mask
+        if not bool(union.any()):
+            raise ValueError("neither the photograph nor the rendering shows a hand")
+        return dilated(union, REGION_MARGIN)
+
+
+@dataclass(frozen=True)
+class PaperScores:
+    """Means over the frames of full pictures on black; the background inflates them.
+
+    Attributes:
+        psnr: decibels.
+        ssim: at most 1.
+        hand_share: share of the pixels that show the hand.
+    """
+
+    psnr: float
+    ssim: float
+    hand_share: float
+
+
+@dataclass(frozen=True)
+class MaskedScores:
+    """Means over the frames, inside ``JudgedFrame.region``.
+
+    Attributes:
+        psnr: decibels.
+        ssim: at most 1.
+        worst5_psnr: mean over the worst 5 % of the frames, at least one.
+    """
+
+    psnr: float
+    ssim: float
+    worst5_psnr: float
+
+
+def paper_scores(frames: Sequence[JudgedFrame]) -> PaperScores:
+    """Protocol ``paper``: the whole picture.
+
+    Source: paper Sec. 4.1; background, 8 bit and averaging as in the authors' code.
+    """
+    pairs = [frame.on_black() for frame in frames]
+    return PaperScores(
+        psnr=_mean([psnr(rendered, truth) for rendered, truth in pairs]),
+        ssim=_mean([float(ssim(rendered, truth)) for rendered, truth in pairs]),
+        hand_share=_mean([float(frame.truth_mask.float().mean()) for frame in frames]),
+    )
+
+
+def masked_scores(frames: Sequence[JudgedFrame]) -> MaskedScores:
+    """Protocol ``masked``: the hand and ``REGION_MARGIN`` pixels around it."""
+    ratios = [masked_psnr(frame) for frame in frames]
+    return MaskedScores(
+        psnr=_mean(ratios),
+        ssim=_mean([masked_ssim(frame) for frame in frames]),
+        worst5_psnr=worst_mean(ratios, 0.05),
+    )
+
+
+def masked_psnr(frame: JudgedFrame) -> float:
+    """Decibels over the pixels of the frame's region."""
+    rendered, truth = frame.on_black()
+    region = frame.region()
+    return psnr(rendered[region], truth[region])
+
+
+def masked_ssim(frame: JudgedFrame) -> float:
+    """Mean of the similarity map over the region, as far as its windows fit in the image."""
+    inner = slice(_WINDOW_RADIUS, -_WINDOW_RADIUS)
+    similarity = ssim_map(*frame.on_black())
+    region = frame.region()[inner, inner]
+    return float(similarity[region].mean()) if bool(region.any()) else float(similarity.mean())
+
+
+def mean_mask_iou(frames: Sequence[JudgedFrame]) -> float:
+    """Mean over the frames of the masks' intersection over union."""
+    return _mean([mask_iou(frame.rendered_mask, frame.truth_mask) for frame in frames])
+
+
+def worst_mean(values: Sequence[float], share: float) -> float:
+    """Mean of the lowest share of the values, at least one."""
+    count = max(1, math.ceil(share * len(values) - 1e-9))
+    return _mean(sorted(values)[:count])
+
+
+def mean_color(
+    images: Sequence[Float[Tensor, "height width 3"]], masks: Sequence[Bool[Tensor, "height width"]]
+) -> Float[Tensor, "3"]:
+    """Mean colour of all hand pixels, in [0, 1]."""
+    return torch.cat([image[mask] for image, mask in zip(images, masks, strict=True)]).mean(0)
+
+
+def mean_color_masked_psnr(
+    color: Float[Tensor, "3"],
+    images: Sequence[Float[Tensor, "height width 3"]],
+    masks: Sequence[Bool[Tensor, "height width"]],
+) -> float:
+    """The baseline that knows the true mask and nothing else: one colour painted into it.
+
+    Args:
+        color: :func:`mean_color` of the training frames.
+        images: the frames to be judged.
+        masks: their true masks.
+
+    Returns:
+        The masked protocol's PSNR, decibels.
+    """
+    return _mean(
+        [
+            masked_psnr(JudgedFrame(color * mask[..., None], mask, image, mask))
+            for image, mask in zip(images, masks, strict=True)
+        ]
+    )
+
+
+def albedo_psnr(
+    albedos: Sequence[Float[Tensor, "height width 3"]],
+    truths: Sequence[Float[Tensor, "height width 3"]],
+    masks: Sequence[Bool[Tensor, "height width"]],
+) -> float:
+    """Decibels over all hand pixels of a subject, after one scale per colour channel.
+
+    A brighter albedo under a dimmer light is the same picture; the scale with the least squared
+    error, one for the whole subject, takes that freedom away. Not clamped to [0, 1].
+
+    Args:
+        albedos: predicted, of one subject.
+        truths: true, in the same encoding.
+        masks: pixels where both are defined.
+    """
+    predicted, true = _pooled(albedos, masks), _pooled(truths, masks)
+    squares = predicted.square().sum(0)
+    scale = (predicted * true).sum(0) / squares.clamp_min(torch.finfo(squares.dtype).tiny)
+    return psnr(predicted * scale, true)
+
+
+def shading_correlation(
+    illuminations: Sequence[Float[Tensor, "height width"]],
+    shadings: Sequence[Float[Tensor, "height width"]],
+    masks: Sequence[Bool[Tensor, "height width"]],
+) -> float:
+    """Pearson correlation of illumination and true shading over all hand pixels of a subject.
+
+    Zero where one of them is constant.
+
+    Args:
+        illuminations: predicted.
+        shadings: true, in the same encoding.
+        masks: pixels where both are defined.
+    """
+    predicted, true = (
+        _pooled([value[..., None] for value in values], masks)[:, 0]
+        for values in (illuminations, shadings)
+    )
+    predicted, true = predicted - predicted.mean(), true - true.mean()
+    norm = float(predicted.norm() * true.norm())
+    return float(predicted @ true) / norm if norm > 1e-12 else 0.0
+
+
+def _pooled(
+    values: Sequence[Float[Tensor, "height width channels"]],
+    masks: Sequence[Bool[Tensor, "height width"]],
+) -> Float[Tensor, "points channels"]:
+    return torch.cat([value[mask] for value, mask in zip(values, masks, strict=True)]).double()
+
+
+def _mean(values: Sequence[float]) -> float:
+    if not values:
+        raise ValueError("there is no frame to judge")
+    return math.fsum(values) / len(values)
+
+
+def _window_mean(
+    values: Float[Tensor, "channels height width"],
+) -> Float[Tensor, "channels inner_height inner_width"]:
+    """Gaussian-weighted mean of every whole window, one direction after the other."""
+    steps = torch.arange(-_WINDOW_RADIUS, _WINDOW_RADIUS + 1, device=values.device)
+    weights = torch.exp(-0.5 * (steps.to(values.dtype) / _WINDOW_SIGMA).square())
+    weights = weights / weights.sum()
+    rows = conv2d(values[:, None], weights[None, None, None, :])
+    return conv2d(rows, weights[None, None, :, None])[:, 0]

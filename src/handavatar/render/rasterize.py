@@ -1,0 +1,174 @@
+"""Hard rasterisation: which face each pixel sees, without gradient.
+
+Image positions in pixels, pixel centres at +0.5, depths in metres along the optical axis.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from handavatar.geometry.cameras import Camera, project
+
+NEAR_PLANE = 1e-4
+"""Metres; a face with a vertex at this depth or nearer is not drawn (nothing is clipped)."""
+
+_PAIRS_AT_ONCE = 1 << 21
+
+
+@dataclass(frozen=True, eq=False)
+class Fragments:
+    """The nearest surface point behind each pixel centre.
+
+    Attributes:
+        face_index: which face, -1 where there is none.
+        depth: metres along the optical axis, infinity where there is no face.
+        barycentric: perspective-correct weights of the face's corners: they interpolate
+            quantities that are linear on the surface in space. Zero where there is no face.
+    """
+
+    face_index: Int[Tensor, "height width"]
+    depth: Float[Tensor, "height width"]
+    barycentric: Float[Tensor, "height width 3"]
+
+    @property
+    def mask(self) -> Bool[Tensor, "height width"]:
+        """Pixels whose centre some face covers."""
+        return self.face_index >= 0
+
+
+@torch.no_grad()
+def rasterize(
+    vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"], camera: Camera
+) -> Fragments:
+    """Z-buffer of a mesh, both sides of its faces.
+
+    A face covers a pixel if the pixel's centre lies in its closed projection; of several faces
+    the nearest wins, of equally near ones (to float32) the first. Neighbouring faces leave no
+    gap: the test of a shared edge is antisymmetric to the last bit. Faces without projected area
+    and faces that reach ``NEAR_PLANE`` are skipped.
+
+    Args:
+        vertices: metres, world.
+        faces: either winding.
+        camera: the view.
+    """
+    pixels, depths = project(camera, vertices)
+    corners, corner_depths = pixels.double()[faces], depths.double()[faces]
+    nearest = torch.full(
+        (camera.height * camera.width,),
+        torch.iinfo(torch.int64).max,
+        dtype=torch.int64,
+        device=vertices.device,
+    )
+    drawn = (corner_depths > NEAR_PLANE).all(-1).nonzero()[:, 0]
+    lower, upper = corners[drawn].amin(1), corners[drawn].amax(1)
+    for row, x, y in pixels_in_boxes(lower, upper, camera.width, camera.height):
+        face = drawn[row]
+        weights, covers = _screen_weights(corners[face], x, y)
+        face, x, y = face[covers], x[covers], y[covers]
+        depth = 1 / (weights[covers] / corner_depths[face]).sum(-1)
+        # Positive floats order like their bits: one integer holds depth first, then the face.
+        key = (depth.float().view(torch.int32).long() << 32) | face
+        nearest.scatter_reduce_(0, y * camera.width + x, key, "amin")
+    return _fragments(nearest, corners, corner_depths, camera, vertices.dtype)
+
+
+def interpolate(
+    fragments: Fragments,
+    faces: Int[Tensor, "faces 3"],
+    vertex_values: Float[Tensor, "vertices channels"],
+) -> Float[Tensor, "height width channels"]:
+    """Per-vertex values at the surface points that the pixels see; zero where there is none.
+
+    Differentiable in the values, not in the position of the surface.
+    """
+    corner_values = vertex_values[faces[fragments.face_index.clamp_min(0)]]
+    weights = fragments.barycentric.to(vertex_values.dtype)
+    return (corner_values * weights[..., None]).sum(-2)
+
+
+def pixels_in_boxes(
+    lower: Float[Tensor, "boxes 2"], upper: Float[Tensor, "boxes 2"], width: int, height: int
+) -> Iterator[tuple[Int[Tensor, "pairs"], Int[Tensor, "pairs"], Int[Tensor, "pairs"]]]:
+    """Every box of the image plane paired with every pixel whose centre lies in it.
+
+    Work is proportional to the number of pairs, however unequal the boxes are.
+
+    Args:
+        lower: smallest (x, y) of each box, pixels; must be finite.
+        upper: largest (x, y).
+        width: image width; the boxes are clipped to the image.
+        height: image height.
+
+    Yields:
+        Batches of (box, x, y), so that few pairs are in memory at once.
+    """
+    size = lower.new_tensor([width, height])
+    first = (lower - 0.5).ceil().clamp_min(0).minimum(size)
+    last = (upper - 0.5).floor().clamp_min(-1).minimum(size - 1)
+    extent = (last - first + 1).clamp_min(0).long()
+    box = (extent.prod(-1) > 0).nonzero()[:, 0]
+    first, extent = first[box].long(), extent[box]
+    count = extent.prod(-1)
+    batch = (count.cumsum(0) - count) // _PAIRS_AT_ONCE
+    start = 0
+    for length in torch.unique_consecutive(batch, return_counts=True)[1].tolist():
+        chosen = slice(start, start + length)
+        start += length
+        row = torch.arange(length, device=box.device).repeat_interleave(count[chosen])
+        begin = count[chosen].cumsum(0) - count[chosen]
+        rank = torch.arange(len(row), device=box.device) - begin[row]
+        columns = extent[chosen][row, 0]
+        x = first[chosen][row, 0] + rank % columns
+        y = first[chosen][row, 1] + torch.div(rank, columns, rounding_mode="floor")
+        yield box[chosen][row], x, y
+
+
+def _screen_weights(
+    corners: Float[Tensor, "pairs 3 2"], x: Int[Tensor, "pairs"], y: Int[Tensor, "pairs"]
+) -> tuple[Float[Tensor, "pairs 3"], Bool[Tensor, "pairs"]]:
+    """Barycentric weights in the image at pixel centres, and whether the face covers them."""
+    dx, dy = corners[..., 0] - (x + 0.5)[:, None], corners[..., 1] - (y + 0.5)[:, None]
+    doubled_areas = torch.stack(
+        [
+            dx[:, 1] * dy[:, 2] - dx[:, 2] * dy[:, 1],
+            dx[:, 2] * dy[:, 0] - dx[:, 0] * dy[:, 2],
+            dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0],
+        ],
+        dim=-1,
+    )
+    total = doubled_areas.sum(-1)
+    one_sided = (doubled_areas >= 0).all(-1) | (doubled_areas <= 0).all(-1)
+    covers = one_sided & (total != 0)
+    safe = torch.where(covers, total, torch.ones_like(total))
+    return doubled_areas / safe[:, None], covers
+
+
+def _fragments(
+    nearest: Int[Tensor, "pixels"],
+    corners: Float[Tensor, "faces 3 2"],
+    corner_depths: Float[Tensor, "faces 3"],
+    camera: Camera,
+    dtype: torch.dtype,
+) -> Fragments:
+    """Depth and weights of the winning faces, computed once more at full precision."""
+    shape = (camera.height, camera.width)
+    pixel = (nearest != torch.iinfo(torch.int64).max).nonzero()[:, 0]
+    face = nearest[pixel] & 0xFFFFFFFF
+    x = pixel % camera.width
+    y = torch.div(pixel, camera.width, rounding_mode="floor")
+    weights, _ = _screen_weights(corners[face], x, y)
+    per_depth = weights / corner_depths[face]
+    inverse_depth = per_depth.sum(-1)
+    face_index = torch.full_like(nearest, -1)
+    face_index[pixel] = face
+    depth = torch.full((len(nearest),), torch.inf, dtype=dtype, device=nearest.device)
+    depth[pixel] = (1 / inverse_depth).to(dtype)
+    barycentric = torch.zeros(len(nearest), 3, dtype=dtype, device=nearest.device)
+    barycentric[pixel] = (per_depth / inverse_depth[:, None]).to(dtype)
+    return Fragments(
+        face_index.reshape(shape), depth.reshape(shape), barycentric.reshape(*shape, 3)
+    )

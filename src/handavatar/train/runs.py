@@ -1,0 +1,463 @@
+"""The run folder: options, facts, log, checkpoints; survives a kill at any moment.
+
+```
+run/  options.json  run.json  log.jsonl  avatar.safetensors  .lock
+      checkpoints/step-000001000/{model,optimizer}.safetensors  state.json  MANIFEST.json
+      corrupt/  evaluation/  renders/
+```
+
+A checkpoint is written aside, synced to disk and renamed into place, so a folder called ``step-*``
+is whole unless the disk itself lied; the manifest's sizes and hashes find that out. Tensors are
+safetensors, the rest is JSON: nothing here can execute what it reads.
+"""
+
+import errno
+import fcntl
+import json
+import logging
+import os
+import re
+import shutil
+import socket
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+from safetensors import SafetensorError
+from torch import Tensor
+
+from handavatar.train.provenance import package_versions, source_commit
+
+Json = dict[str, Any]
+
+_SCHEMA = 1
+_KEPT_CHECKPOINTS = 3
+_MANIFEST = "MANIFEST.json"
+_STATE = "state.json"
+_STEP_FOLDER = re.compile(r"step-(\d{9,})")
+_FILE_NAME = re.compile(r"[a-z][a-z0-9_]*\.(safetensors|json)")
+_MAX_MANIFEST_BYTES = 1 << 20
+
+_log = logging.getLogger(__name__)
+
+
+class CheckpointError(ValueError):
+    """A run, checkpoint or avatar file that cannot be used: the file, what is wrong, the remedy."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder on disk.
+
+    Attributes:
+        folder: holds everything that one training wrote.
+    """
+
+    folder: Path
+
+    @property
+    def checkpoints(self) -> Path:
+        """Folder of the ``step-*`` folders."""
+        return self.folder / "checkpoints"
+
+    @property
+    def log(self) -> Path:
+        """One JSON object a line, each with its ``step``."""
+        return self.folder / "log.jsonl"
+
+    @property
+    def avatar(self) -> Path:
+        """The finished avatar, one file."""
+        return self.folder / "avatar.safetensors"
+
+    @property
+    def options(self) -> Json:
+        """The options the run was started with."""
+        return _read_json(self.folder / "options.json", "start a new run: handavatar train CAPTURE")
+
+    @property
+    def facts(self) -> Json:
+        """Contents of ``run.json``: versions, commit, seed, capture, command, perceptual loss."""
+        return _read_json(self.folder / "run.json", "start a new run: handavatar train CAPTURE")
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint folder whose manifest was found true.
+
+    Attributes:
+        folder: ``.../checkpoints/step-000001000``.
+        step: training steps done when it was written.
+    """
+
+    folder: Path
+    step: int
+
+
+@dataclass(frozen=True)
+class CheckpointContents:
+    """What a checkpoint holds.
+
+    Attributes:
+        tensors: file stem (``model``, ``optimizer``) to named tensors, on the CPU.
+        state: everything else, as JSON.
+    """
+
+    tensors: dict[str, dict[str, Tensor]]
+    state: Json
+
+
+# --- the folder -----------------------------------------------------------------------------------
+
+
+def default_run_folder(capture: Path, method: str, outputs: Path = Path("outputs")) -> Path:
+    """``outputs/{capture}/{method}/{time}``, local time to the second."""
+    return outputs / capture.resolve().name / method / datetime.now().strftime("%Y-%m-%d_%H%M%S")
+
+
+def latest_run_folder(capture: Path, method: str, outputs: Path = Path("outputs")) -> Path | None:
+    """The newest run of a capture and method that has begun, for ``--resume auto``."""
+    runs = (outputs / capture.resolve().name / method).glob("*/run.json")
+    return max((path.parent for path in runs), default=None, key=lambda folder: folder.name)
+
+
+def create_run(
+    folder: Path,
+    options: Json,
+    *,
+    seed: int,
+    capture: Path,
+    capture_sha256: str,
+    perceptual: str,
+    overwrite: bool = False,
+) -> Run:
+    """Makes the folder with ``options.json`` and ``run.json``.
+
+    Args:
+        folder: must not exist or be empty.
+        options: what to train, JSON values only.
+        seed: of the training.
+        capture: folder of the capture.
+        capture_sha256: fingerprint of the capture's files.
+        perceptual: the perceptual loss in use, ``lpips-vgg`` or the substitute's name.
+        overwrite: replace the run that lies there; a folder that is no run is never touched.
+
+    Raises:
+        CheckpointError: if the folder holds something already.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        if not (overwrite and (folder / "run.json").is_file()):
+            raise CheckpointError(
+                f"{folder}: not empty, expected a new folder\n"
+                "name another with --out, or continue this run with --resume auto"
+            )
+        shutil.rmtree(folder)
+    run = Run(folder)
+    run.checkpoints.mkdir(parents=True)
+    write_json(folder / "options.json", options)
+    facts = {
+        "schema": _SCHEMA,
+        "versions": package_versions(),
+        "commit": source_commit(),
+        "seed": seed,
+        "capture": {"path": str(capture.resolve()), "sha256": capture_sha256},
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+        "perceptual": perceptual,
+        "started": datetime.now().astimezone().isoformat(timespec="seconds"),
+    }
+    write_json(folder / "run.json", facts)
+    return run
+
+
+def open_run(folder: Path) -> Run:
+    """An existing run folder.
+
+    Raises:
+        CheckpointError: if it is none.
+    """
+    if not (folder / "run.json").is_file():
+        raise CheckpointError(
+            f"{folder}: no run.json in it, so it is not a run folder\n"
+            "give the folder that handavatar train printed, under outputs/"
+        )
+    return Run(folder)
+
+
+@contextmanager
+def locked(run: Run) -> Iterator[None]:
+    """One writer per run folder; the lock falls with the process, however that ends.
+
+    Raises:
+        CheckpointError: if another process holds it.
+    """
+    with open(run.folder / ".lock", "a+", encoding="utf-8") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.seek(0)
+            holder = file.read(200).strip() or "another process"
+            raise CheckpointError(
+                f"{run.folder}: {holder} is writing this run\n"
+                "wait until it has ended or stop it, or train into another folder with --out"
+            ) from error
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}")
+        file.flush()
+        yield
+
+
+def write_json(path: Path, value: Json) -> None:
+    """Replaces a JSON file in one step; NaN is refused."""
+    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
+    aside = path.with_name(f".tmp-{os.getpid()}-{path.name}")
+    try:
+        _write_synced(aside, text.encode())
+        aside.replace(path)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+# --- the log --------------------------------------------------------------------------------------
+
+
+def append_log(run: Run, step: int, record: Json) -> None:
+    """Adds one line, ``{"step": step, ...}``, in one write."""
+    line = json.dumps({"step": step} | record, allow_nan=False) + "\n"
+    with open(run.log, "ab", buffering=0) as file:
+        file.write(line.encode())
+
+
+def read_log(run: Run) -> list[Json]:
+    """All whole lines; a line that a kill tore is left out."""
+    return [record for _, record in _log_lines(run)]
+
+
+def truncate_log(run: Run, step: int) -> None:
+    """Forgets what was logged after ``step``, so that a resumed log equals an uninterrupted one."""
+    kept = b"".join(line for line, record in _log_lines(run) if record["step"] <= step)
+    aside = run.log.with_name(f".tmp-{os.getpid()}-log.jsonl")
+    try:
+        _write_synced(aside, kept)
+        aside.replace(run.log)
+    finally:
+        aside.unlink(missing_ok=True)
+
+
+def _log_lines(run: Run) -> Iterator[tuple[bytes, Json]]:
+    if not run.log.exists():
+        return
+    for line in run.log.read_bytes().splitlines(keepends=True):
+        try:
+            record = json.loads(line)
+        except ValueError:
+            continue
+        if (
+            line.endswith(b"\n")
+            and isinstance(record, dict)
+            and isinstance(record.get("step"), int)
+        ):
+            yield line, record
+
+
+# --- checkpoints ----------------------------------------------------------------------------------
+
+
+def save_checkpoint(
+    run: Run, step: int, tensors: Mapping[str, Mapping[str, Tensor]], state: Json
+) -> Checkpoint:
+    """Writes a checkpoint so that at every moment a whole one lies on the disk.
+
+    Args:
+        run: whose lock the caller holds.
+        step: training steps done.
+        tensors: file stem (``model``, ``optimizer``) to named tensors.
+        state: everything else; JSON values only, no NaN.
+
+    Raises:
+        OSError: if the disk is full or refuses; earlier checkpoints stay as they were.
+    """
+    for stem in tensors:
+        if not _FILE_NAME.fullmatch(f"{stem}.safetensors"):
+            raise ValueError(f"checkpoint file {stem!r}: expected lower-case letters and _")
+    payloads = {
+        f"{stem}.safetensors": safetensors.torch.save(
+            {name: value.detach().cpu().contiguous().clone() for name, value in group.items()}
+        )
+        for stem, group in tensors.items()
+    }
+    payloads[_STATE] = json.dumps(state, allow_nan=False).encode()
+    files = {
+        name: {"size": len(data), "sha256": sha256(data).hexdigest()}
+        for name, data in payloads.items()
+    }
+    manifest = json.dumps({"schema": _SCHEMA, "step": step, "files": files}, indent=2).encode()
+
+    run.checkpoints.mkdir(parents=True, exist_ok=True)
+    _remove_leftovers(run)
+    _require_free_space(run.checkpoints, 2 * sum(len(data) for data in payloads.values()))
+    final = run.checkpoints / f"step-{step:09d}"
+    aside = run.checkpoints / f".tmp-{os.getpid()}-{step}"
+    try:
+        aside.mkdir()
+        for name, data in payloads.items():
+            _write_synced(aside / name, data)
+        _write_synced(aside / _MANIFEST, manifest)
+        _sync_folder(aside)
+        if final.exists():
+            final.rename(run.checkpoints / f".tmp-{os.getpid()}-{step}-replaced")
+        aside.rename(final)
+        _sync_folder(run.checkpoints)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+    _remove_leftovers(run)
+    for _, folder in _step_folders(run)[_KEPT_CHECKPOINTS:]:
+        # Renamed first: a kill half way through the removal leaves no step-* folder with holes.
+        doomed = run.checkpoints / f".tmp-{os.getpid()}-pruned-{folder.name}"
+        folder.rename(doomed)
+        shutil.rmtree(doomed, ignore_errors=True)
+    return Checkpoint(final, step)
+
+
+def latest_checkpoint(run: Run) -> Checkpoint | None:
+    """The newest checkpoint that is whole; broken ones move to ``corrupt/`` with a warning."""
+    for step, folder in _step_folders(run):
+        checkpoint = Checkpoint(folder, step)
+        try:
+            _verified_payloads(checkpoint)
+        except CheckpointError as error:
+            _log.warning("%s; moved to corrupt/", str(error).splitlines()[0])
+            _move_to_corrupt(run, folder)
+        else:
+            return checkpoint
+    return None
+
+
+def load_checkpoint(checkpoint: Checkpoint) -> CheckpointContents:
+    """Reads a checkpoint; every byte is checked against the manifest first.
+
+    Raises:
+        CheckpointError: if a file is missing, cut, changed or of another version.
+    """
+    payloads = _verified_payloads(checkpoint)
+    tensors: dict[str, dict[str, Tensor]] = {}
+    state: Json = {}
+    for name, data in payloads.items():
+        path = checkpoint.folder / name
+        try:
+            if name == _STATE:
+                state = json.loads(data)
+            else:
+                tensors[path.stem] = safetensors.torch.load(data)
+        except (ValueError, RecursionError, SafetensorError) as error:
+            raise _broken(path, f"cannot be read ({error})") from error
+    return CheckpointContents(tensors, state)
+
+
+def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
+    path = checkpoint.folder / _MANIFEST
+    try:
+        with open(path, "rb") as file:
+            manifest = json.loads(file.read(_MAX_MANIFEST_BYTES))
+        files = {
+            str(name): (int(entry["size"]), str(entry["sha256"]))
+            for name, entry in manifest["files"].items()
+        }
+        schema, step = int(manifest["schema"]), int(manifest["step"])
+    except FileNotFoundError as error:
+        raise _broken(path, "is missing") from error
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise _broken(path, "is not a manifest (cut or overwritten)") from error
+    if schema > _SCHEMA:
+        raise CheckpointError(
+            f"{path}: written by a newer version (schema {schema}, this one knows {_SCHEMA})\n"
+            "update handavatar, or train again with this version"
+        )
+    if step != checkpoint.step or _STATE not in files:
+        raise _broken(path, f"does not belong to step {checkpoint.step}")
+    payloads = {}
+    for name, (size, digest) in files.items():
+        member = checkpoint.folder / name
+        if not _FILE_NAME.fullmatch(name):
+            raise _broken(path, f"names a file outside the folder: {name!r}")
+        try:
+            found = member.stat().st_size
+            data = member.read_bytes() if found == size else b""
+        except OSError as error:
+            raise _broken(member, f"cannot be read ({error.strerror})") from error
+        if found != size:
+            raise _broken(member, f"has {found} bytes, the manifest says {size}")
+        if sha256(data).hexdigest() != digest:
+            raise _broken(member, "has other contents than the manifest says")
+        payloads[name] = data
+    return payloads
+
+
+def _broken(path: Path, what: str) -> CheckpointError:
+    return CheckpointError(
+        f"{path}: {what}\n"
+        "continue from the newest whole checkpoint with --resume auto, or train again"
+    )
+
+
+def _step_folders(run: Run) -> list[tuple[int, Path]]:
+    """All ``step-*`` folders, newest first."""
+    if not run.checkpoints.is_dir():
+        return []
+    matches = ((_STEP_FOLDER.fullmatch(path.name), path) for path in run.checkpoints.iterdir())
+    return sorted(((int(match[1]), path) for match, path in matches if match), reverse=True)
+
+
+def _move_to_corrupt(run: Run, folder: Path) -> None:
+    corrupt = run.folder / "corrupt"
+    corrupt.mkdir(exist_ok=True)
+    target, number = corrupt / folder.name, 1
+    while target.exists():
+        target, number = corrupt / f"{folder.name}.{number}", number + 1
+    folder.rename(target)
+
+
+def _remove_leftovers(run: Run) -> None:
+    """What a killed process left half written or half removed; the caller is the one writer."""
+    for path in run.checkpoints.glob(".tmp-*"):
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _require_free_space(folder: Path, num_bytes: int) -> None:
+    free = shutil.disk_usage(folder).free
+    if free < num_bytes:
+        raise OSError(
+            errno.ENOSPC, f"a checkpoint needs {num_bytes} bytes free, found {free}", str(folder)
+        )
+
+
+def _write_synced(path: Path, data: bytes) -> None:
+    with open(path, "wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _sync_folder(folder: Path) -> None:
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _read_json(path: Path, remedy: str) -> Json:
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise CheckpointError(f"{path}: is missing\n{remedy}") from error
+    except (ValueError, RecursionError) as error:
+        raise CheckpointError(f"{path}: is not JSON ({error})\n{remedy}") from error
+    if not isinstance(value, dict):
+        raise CheckpointError(f"{path}: expected a JSON object, found {type(value).__name__}")
+    return value
