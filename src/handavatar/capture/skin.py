@@ -119,6 +119,25 @@ def paint_skin(
     return torch.from_numpy(texture[tuple(nearest)]).float()
 
 
+def smooth_noise(
+    points: Float64[np.ndarray, "points 3"],
+    wavelength: Float64[np.ndarray, "3"],
+    random: np.random.Generator,
+) -> Float64[np.ndarray, "points"]:
+    """Smooth random values of about unit variance over space.
+
+    Args:
+        points: where.
+        wavelength: distance between independent values along x, y and z, in the points' unit.
+        random: draws the values.
+    """
+    cells = points / wavelength
+    cells = cells - cells.min(0) + 2
+    grid = random.standard_normal(np.ceil(cells.max(0)).astype(int) + 3)
+    # The smoothing spline halves the deviation or so; the factor brings it back.
+    return 1.7 * ndimage.map_coordinates(grid, cells.T, order=3, prefilter=False)
+
+
 class _Painter:
     """Layers of paint over the texels, each a function of the place on the template hand."""
 
@@ -168,11 +187,7 @@ class _Painter:
     def noise(
         self, wavelength: float, stretch: tuple[float, float, float] = (1, 1, 1)
     ) -> np.ndarray:
-        """Smooth random values of about unit variance, by millimetres along x, y, z."""
-        points = self.places / (wavelength * np.array(stretch))
-        points = points - points.min(0) + 2
-        grid = self.random.standard_normal(np.ceil(points.max(0)).astype(int) + 3)
-        return 1.7 * ndimage.map_coordinates(grid, points.T, order=3, prefilter=False)
+        return smooth_noise(self.places, wavelength * np.array(stretch), self.random)
 
     def along(self, bone: int) -> tuple[np.ndarray, np.ndarray]:
         """Millimetres from a joint along its bone, and across it."""

@@ -9,6 +9,7 @@ folder (``$TORCH_HOME/hub/checkpoints``, by default ``~/.cache/torch/hub/checkpo
 """
 
 import hashlib
+import os
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Literal, final
@@ -53,6 +54,9 @@ class LpipsVgg(PerceptualLoss):
 
     Source: paper Sec. 4.1, LPIPS (Zhang et al. 2018, Eq. 1), version 0.1.
     """
+
+    mean: Tensor
+    spread: Tensor
 
     # Per stage, the layer numbers of the convolutions in torchvision's ``vgg16().features``.
     stages = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
@@ -118,7 +122,7 @@ class GradientStructure(PerceptualLoss):
         this one are no LPIPS figures, hence the name that the run records.
     """
 
-    def __init__(self, gradient_weight: float = 2.0, structure_weight: float = 0.25) -> None:
+    def __init__(self, gradient_weight: float = 2.0, structure_weight: float = 1.0) -> None:
         """Sets the weights of the two terms; the defaults make them about equal on blurred skin.
 
         Args:
@@ -178,7 +182,7 @@ def perceptual_loss(
     """
     if prefer == "substitute":
         return GradientStructure()
-    folder = folder or Path(torch.hub.get_dir()) / "checkpoints"
+    folder = folder or _checkpoint_folder()
     backbone = folder / BACKBONE_FILE
     heads = next((folder / n for n in HEADS_FILES if (folder / n).is_file()), folder / "vgg.pth")
     missing = [path.name for path in (backbone, heads) if not path.is_file()]
@@ -188,11 +192,18 @@ def perceptual_loss(
         )
     if prefer == "lpips":
         raise FileNotFoundError(
-            f"LPIPS needs {' and '.join(missing)} in {folder}: the VGG-16 backbone is torchvision's "
-            f"{BACKBONE_FILE}, the heads are weights/v0.1/vgg.pth of the lpips package. "
+            f"LPIPS needs {' and '.join(missing)} in {folder}: the VGG-16 backbone is "
+            f"torchvision's, the heads are weights/v0.1/{HEADS_FILES[1]} of the lpips package. "
             "Or choose the substitute."
         )
     return GradientStructure()
+
+
+def _checkpoint_folder() -> Path:
+    """Where torch keeps files that it fetched."""
+    cache = os.environ.get("XDG_CACHE_HOME", "~/.cache")
+    home = os.environ.get("TORCH_HOME", os.path.join(cache, "torch"))
+    return Path(home).expanduser() / "hub" / "checkpoints"
 
 
 def _read_weights(path: Path, fingerprint: str) -> dict[str, Tensor]:

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from handavatar.field.layers import MLP, positional_encoding
 from handavatar.hand.pose import NUM_BONES
-from handavatar.hand.rig import Rig, ShapedHand
+from handavatar.hand.rig import ShapedHand
 
 HAND_SCALE = 0.1
 """Rest positions are divided by this (metres) before they are encoded."""
@@ -58,6 +58,6 @@ def personal_hand(rig: Rig, rest: ShapedHand, offsets: Float[Tensor, "vertices 3
     Source: paper Sec. 3.1, V~ = V + M_shape.
     """
     vertices = rest.rest_vertices + offsets
-    joints = rig.joint_regressor @ vertices
+    joints = rest.rig.joint_regressor @ vertices
     shift = rest.rest_joints[0] - joints[0]
-    return ShapedHand(rig, vertices + shift, joints + shift)
+    return ShapedHand(rest.rig, vertices + shift, joints + shift)

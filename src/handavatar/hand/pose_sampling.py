@@ -37,15 +37,15 @@ class JointLimits:
 
 
 JOINT_LIMITS: dict[str, JointLimits] = {
-    "index1": JointLimits((-15, 90), (-8, 16)),
-    "middle1": JointLimits((-15, 90), (-9, 9)),
-    "ring1": JointLimits((-15, 90), (-14, 8)),
-    "little1": JointLimits((-15, 90), (-25, 8)),
-    **{f"{finger}2": JointLimits((0, 105)) for finger in ("index", "middle", "ring", "little")},
-    **{f"{finger}3": JointLimits((-5, 65)) for finger in ("index", "middle", "ring", "little")},
-    "thumb1": JointLimits((-25, 40), (-20, 25), (-40, 20)),
-    "thumb2": JointLimits((-10, 50)),
-    "thumb3": JointLimits((-15, 70)),
+    "index1": JointLimits((-15.0, 90.0), (-8.0, 16.0)),
+    "middle1": JointLimits((-15.0, 90.0), (-9.0, 9.0)),
+    "ring1": JointLimits((-15.0, 90.0), (-14.0, 8.0)),
+    "little1": JointLimits((-15.0, 90.0), (-25.0, 8.0)),
+    **{f"{finger}2": JointLimits((0.0, 105.0)) for finger in ("index", "middle", "ring", "little")},
+    **{f"{finger}3": JointLimits((-5.0, 65.0)) for finger in ("index", "middle", "ring", "little")},
+    "thumb1": JointLimits((-25.0, 40.0), (-20.0, 25.0), (-40.0, 20.0)),
+    "thumb2": JointLimits((-10.0, 50.0)),
+    "thumb3": JointLimits((-15.0, 70.0)),
 }
 """Every joint but the wrist, which is free: its rotation is the hand's place in the world."""
 
@@ -335,30 +335,62 @@ _FIST_RING = (84.0, 90.0, 42.0, 0.0)
 _FIST_LITTLE = (86.0, 88.0, 40.0, 0.0)
 
 GESTURES: dict[str, Gesture] = {
-    "flat": Gesture(_STRAIGHT, _STRAIGHT, _STRAIGHT, _STRAIGHT, (0, 0, 0, 0, 0)),
+    "flat": Gesture(_STRAIGHT, _STRAIGHT, _STRAIGHT, _STRAIGHT, (0.0, 0.0, 0.0, 0.0, 0.0)),
     "spread": Gesture(
-        (-4, 0, 0, 14), (-4, 0, 0, 2), (-4, 0, 0, -11), (-4, 0, 0, -22), (-20, 0, 0, -5, -5)
+        (-4.0, 0.0, 0.0, 14.0),
+        (-4.0, 0.0, 0.0, 2.0),
+        (-4.0, 0.0, 0.0, -11.0),
+        (-4.0, 0.0, 0.0, -22.0),
+        (-20.0, 0.0, 0.0, -5.0, -5.0),
     ),
     "relaxed": Gesture(
-        (18, 25, 12, 2), (24, 32, 15, 0), (28, 36, 17, -1), (30, 36, 17, -3), (4, 6, -8, 10, 14)
+        (18.0, 25.0, 12.0, 2.0),
+        (24.0, 32.0, 15.0, 0.0),
+        (28.0, 36.0, 17.0, -1.0),
+        (30.0, 36.0, 17.0, -3.0),
+        (4.0, 6.0, -8.0, 10.0, 14.0),
     ),
-    "fist": Gesture(_FIST_INDEX, _FIST_MIDDLE, _FIST_RING, _FIST_LITTLE, (22, 14, -32, 28, 40)),
-    "point": Gesture((2, 3, 1, 0), _FIST_MIDDLE, _FIST_RING, _FIST_LITTLE, (29, 12, -38, 21, 30)),
+    "fist": Gesture(
+        _FIST_INDEX, _FIST_MIDDLE, _FIST_RING, _FIST_LITTLE, (20.0, 17.0, -26.0, 30.0, 40.0)
+    ),
+    "point": Gesture(
+        (2.0, 3.0, 1.0, 0.0),
+        _FIST_MIDDLE,
+        _FIST_RING,
+        _FIST_LITTLE,
+        (29.0, 12.0, -38.0, 21.0, 30.0),
+    ),
     "pinch": Gesture(
-        (53, 47, 24, -3), (32, 34, 16, -1), (26, 30, 14, -2), (20, 26, 12, -6), (33, 9, -40, 4, -6)
+        (53.0, 47.0, 24.0, -3.0),
+        (32.0, 34.0, 16.0, -1.0),
+        (26.0, 30.0, 14.0, -2.0),
+        (20.0, 26.0, 12.0, -6.0),
+        (33.0, 9.0, -40.0, 4.0, -6.0),
     ),
     "ok": Gesture(
-        (54, 46, 23, -1), (5, 8, 3, 2), (0, 5, 2, -5), (-4, 3, 1, -14), (32, 10, -40, 5, -6)
+        (54.0, 46.0, 23.0, -1.0),
+        (5.0, 8.0, 3.0, 2.0),
+        (0.0, 5.0, 2.0, -5.0),
+        (-4.0, 3.0, 1.0, -14.0),
+        (32.0, 10.0, -40.0, 5.0, -6.0),
     ),
     "victory": Gesture(
-        (-2, 2, 1, 13), (-2, 2, 1, -8), _FIST_RING, _FIST_LITTLE, (39, 13, -34, 28, 25)
+        (-2.0, 2.0, 1.0, 13.0),
+        (-2.0, 2.0, 1.0, -8.0),
+        _FIST_RING,
+        _FIST_LITTLE,
+        (39.0, 13.0, -34.0, 28.0, 25.0),
     ),
     "thumbs_up": Gesture(
-        _FIST_INDEX, _FIST_MIDDLE, _FIST_RING, _FIST_LITTLE, (-22, -8, 5, -8, -12)
+        _FIST_INDEX, _FIST_MIDDLE, _FIST_RING, _FIST_LITTLE, (-22.0, -8.0, 5.0, -8.0, -12.0)
     ),
     # The one gesture in which fingers push each other beyond their own limits.
     "crossed_fingers": Gesture(
-        (26, 14, 8, -15), (8, 8, 4, 15), _FIST_RING, _FIST_LITTLE, (39, 13, -34, 28, 25)
+        (33.0, 5.0, 3.0, -15.0),
+        (8.0, 20.0, 10.0, 15.0),
+        _FIST_RING,
+        _FIST_LITTLE,
+        (39.0, 13.0, -34.0, 28.0, 25.0),
     ),
 }
 """Poses whose names everybody knows."""

@@ -67,7 +67,7 @@ def rasterize(
     lower, upper = corners[drawn].amin(1), corners[drawn].amax(1)
     for row, x, y in pixels_in_boxes(lower, upper, camera.width, camera.height):
         face = drawn[row]
-        weights, covers = _screen_weights(corners[face], x, y)
+        weights, covers = weights_in_image(corners[face], torch.stack([x, y], dim=-1) + 0.5)
         face, x, y = face[covers], x[covers], y[covers]
         depth = 1 / (weights[covers] / corner_depths[face]).sum(-1)
         # Positive floats order like their bits: one integer holds depth first, then the face.
@@ -118,33 +118,35 @@ def pixels_in_boxes(
     for length in torch.unique_consecutive(batch, return_counts=True)[1].tolist():
         chosen = slice(start, start + length)
         start += length
-        row = torch.arange(length, device=box.device).repeat_interleave(count[chosen])
-        begin = count[chosen].cumsum(0) - count[chosen]
-        rank = torch.arange(len(row), device=box.device) - begin[row]
+        row, rank = numbered_copies(count[chosen])
         columns = extent[chosen][row, 0]
         x = first[chosen][row, 0] + rank % columns
         y = first[chosen][row, 1] + torch.div(rank, columns, rounding_mode="floor")
         yield box[chosen][row], x, y
 
 
-def _screen_weights(
-    corners: Float[Tensor, "pairs 3 2"], x: Int[Tensor, "pairs"], y: Int[Tensor, "pairs"]
+def numbered_copies(
+    counts: Int[Tensor, "items"],
+) -> tuple[Int[Tensor, "copies"], Int[Tensor, "copies"]]:
+    """Each index as often as its count says, and the running number of each copy from 0."""
+    item = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
+    begin = counts.cumsum(0) - counts
+    return item, torch.arange(len(item), device=counts.device) - begin[item]
+
+
+def weights_in_image(
+    corners: Float[Tensor, "pairs 3 2"], points: Float[Tensor, "pairs 2"]
 ) -> tuple[Float[Tensor, "pairs 3"], Bool[Tensor, "pairs"]]:
-    """Barycentric weights in the image at pixel centres, and whether the face covers them."""
-    dx, dy = corners[..., 0] - (x + 0.5)[:, None], corners[..., 1] - (y + 0.5)[:, None]
-    doubled_areas = torch.stack(
-        [
-            dx[:, 1] * dy[:, 2] - dx[:, 2] * dy[:, 1],
-            dx[:, 2] * dy[:, 0] - dx[:, 0] * dy[:, 2],
-            dx[:, 0] * dy[:, 1] - dx[:, 1] * dy[:, 0],
-        ],
-        dim=-1,
-    )
+    """Barycentric weights, linear in the image, and whether the closed triangle holds the point.
+
+    Triangles without area hold nothing. Weights of points outside have no meaning.
+    """
+    (x0, x1, x2), (y0, y1, y2) = (corners - points[:, None]).permute(2, 1, 0)
+    doubled_areas = torch.stack([x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0], dim=-1)
     total = doubled_areas.sum(-1)
-    one_sided = (doubled_areas >= 0).all(-1) | (doubled_areas <= 0).all(-1)
-    covers = one_sided & (total != 0)
-    safe = torch.where(covers, total, torch.ones_like(total))
-    return doubled_areas / safe[:, None], covers
+    one_sided = (doubled_areas.amin(-1) >= 0) | (doubled_areas.amax(-1) <= 0)
+    holds = one_sided & (total != 0)
+    return doubled_areas / torch.where(holds, total, 1.0)[:, None], holds
 
 
 def _fragments(
@@ -160,7 +162,7 @@ def _fragments(
     face = nearest[pixel] & 0xFFFFFFFF
     x = pixel % camera.width
     y = torch.div(pixel, camera.width, rounding_mode="floor")
-    weights, _ = _screen_weights(corners[face], x, y)
+    weights, _ = weights_in_image(corners[face], torch.stack([x, y], dim=-1) + 0.5)
     per_depth = weights / corner_depths[face]
     inverse_depth = per_depth.sum(-1)
     face_index = torch.full_like(nearest, -1)

@@ -4,20 +4,27 @@ Image positions and distances in pixels, pixel centres at +0.5.
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from handavatar.geometry.cameras import Camera, project
-from handavatar.render.rasterize import NEAR_PLANE, pixels_in_boxes, rasterize
+from handavatar.render.rasterize import (
+    NEAR_PLANE,
+    numbered_copies,
+    pixels_in_boxes,
+    rasterize,
+    weights_in_image,
+)
 
 WINDOW = 3.0
 """In units of the softness: farther from the outline the coverage is 0 or 1, which is wrong by
 at most ``sigmoid(-WINDOW ** 2)`` = 1.2e-4."""
 
-# A straight outline through the pixel grid leaves an uncovered centre at most this far behind it.
-_GRID_STEP = 1.0
+_LONGEST_PIECE = 1.0
+_STEP_ACROSS = 0.01
 
 
 def soft_silhouette(
@@ -28,10 +35,9 @@ def soft_silhouette(
 ) -> Float[Tensor, "height width"]:
     """Coverage of each pixel by the mesh: ``sigmoid(sign * distance ** 2 / softness ** 2)``.
 
-    The distance runs from the pixel's centre to the outline of the whole projected mesh, positive
-    inside: coverage exceeds 0.5 just where :func:`rasterize` finds a face, however fine the mesh
-    is. Outside, the value is exact up to the error of ``WINDOW``. Inside, an edge that another
-    part of the mesh hides may stand for an outline at most one pixel farther away.
+    The distance runs from the pixel's centre to the outline of the whole projected mesh; the sign
+    is positive where :func:`rasterize` finds a face. Errors: that of ``WINDOW``; and inside, where
+    one part of the mesh passes behind another, the ends of the outline are known to half a pixel.
 
     Differentiable in the vertices at the ends of the outline's edges. Only pixels within
     ``WINDOW * softness`` of the outline carry gradient; under :func:`silhouette_loss` all of these
@@ -49,21 +55,18 @@ def soft_silhouette(
         outside the mesh, and a fitted finger becomes too thin by twice that. Here the projected
         mesh counts as one polygon; for a single triangle both are equal.
     """
-    radius = WINDOW * softness
-    margin = math.ceil(radius + _GRID_STEP) + 1
     width, height = camera.width, camera.height
-    padded = camera.cropped(-margin, -margin, width + 2 * margin, height + 2 * margin)
-    covered = rasterize(vertices, faces, padded).mask
+    covered = rasterize(vertices, faces, camera).mask.reshape(-1)
     pixels, depths = project(camera, vertices)
-    edges = _contour_edges(pixels.detach(), depths.detach(), faces)
-    pixel, edge = _nearest_edges(pixels.detach()[edges], covered, margin, radius, width, height)
+    seen = faces[(depths[faces] > NEAR_PLANE).all(-1)]
+    outline = _outline(pixels.detach(), seen, WINDOW * softness, width, height)
+    pixel, piece = _nearest_pieces(outline, pixels.detach(), WINDOW * softness, width, height)
 
-    inside = covered[margin : margin + height, margin : margin + width].reshape(-1)
     centers = torch.stack([pixel % width, torch.div(pixel, width, rounding_mode="floor")], dim=-1)
-    squared = _squared_distance(centers.to(pixels) + 0.5, pixels[edges[edge]])
-    sign = torch.where(inside[pixel], 1.0, -1.0).to(squared)
+    squared = outline.squared_distance(piece, centers.to(pixels) + 0.5, pixels)
+    sign = torch.where(covered[pixel], 1.0, -1.0).to(squared)
     soft = torch.sigmoid(sign * squared / softness**2)
-    return inside.to(soft).index_put((pixel,), soft).reshape(height, width)
+    return covered.to(soft).index_put((pixel,), soft).reshape(height, width)
 
 
 def silhouette_loss(
@@ -80,10 +83,68 @@ def silhouette_loss(
     return 1 - intersection / union if bool(union > 0) else union
 
 
-def _contour_edges(
+@dataclass(frozen=True, eq=False)
+class _Pieces:
+    """Stretches of edges in the image.
+
+    Attributes:
+        ends: the vertices at the two ends of the edge.
+        low: where on the edge the piece begins, from 0 at its first vertex to 1 at its second.
+        high: where it ends.
+    """
+
+    ends: Int[Tensor, "pieces 2"]
+    low: Float[Tensor, "pieces"]
+    high: Float[Tensor, "pieces"]
+
+    def chosen(self, index: Bool[Tensor, "pieces"]) -> "_Pieces":
+        return _Pieces(self.ends[index], self.low[index], self.high[index])
+
+    def corners(self, pixels: Float[Tensor, "vertices 2"]) -> Float[Tensor, "pieces 2 2"]:
+        """Begin and end of every piece."""
+        start, end = pixels[self.ends].unbind(1)
+        ratios = torch.stack([self.low, self.high], dim=1)[..., None]
+        return start[:, None] + ratios * (end - start)[:, None]
+
+    def squared_distance(
+        self,
+        piece: Int[Tensor, "pairs"],
+        points: Float[Tensor, "pairs 2"],
+        pixels: Float[Tensor, "vertices 2"],
+    ) -> Float[Tensor, "pairs"]:
+        """Of each point to its piece; differentiable in the vertices."""
+        start, end = pixels[self.ends[piece]].unbind(1)
+        along = end - start
+        length = along.square().sum(-1).clamp_min(1e-12)
+        ratio = ((points - start) * along).sum(-1) / length
+        ratio = ratio.maximum(self.low[piece]).minimum(self.high[piece])
+        return (start + ratio[:, None] * along - points).square().sum(-1)
+
+
+def _outline(
     pixels: Float[Tensor, "vertices 2"],
-    depths: Float[Tensor, "vertices"],
     faces: Int[Tensor, "faces 3"],
+    radius: float,
+    width: int,
+    height: int,
+) -> _Pieces:
+    """The pieces of contours with nothing on one side, as far as the image sees them."""
+    pieces = _split(_contour_edges(pixels, faces), pixels, width + height)
+    corners = pieces.corners(pixels)
+    limit = pixels.new_tensor([width, height]) + radius
+    pieces = pieces.chosen(((corners.amax(1) > -radius) & (corners.amin(1) < limit)).all(-1))
+
+    start, end = pieces.corners(pixels).double().unbind(1)
+    along = torch.nn.functional.normalize(end - start, dim=-1)
+    across = _STEP_ACROSS * torch.stack([-along[:, 1], along[:, 0]], dim=-1)
+    middle = (start + end) / 2
+    sides = torch.cat([middle + across, middle - across])
+    is_covered = _is_covered(sides, pixels.double()[faces], math.ceil(radius) + 1, width, height)
+    return pieces.chosen(~is_covered.reshape(2, -1).all(0))
+
+
+def _contour_edges(
+    pixels: Float[Tensor, "vertices 2"], faces: Int[Tensor, "faces 3"]
 ) -> Int[Tensor, "edges 2"]:
     """Edges that end the front side or the back side of the mesh as seen in the image.
 
@@ -92,72 +153,82 @@ def _contour_edges(
     a, b, c = pixels[faces].unbind(1)
     ab, ac = b - a, c - a
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
-    side = torch.where((depths[faces] > NEAR_PLANE).all(-1), area.sign(), 0).long()
     ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(dim=-1).values
     keys, index = torch.unique(ends[:, 0] * len(pixels) + ends[:, 1], return_inverse=True)
     num_front, num_back = (
-        torch.zeros_like(keys).index_add(0, index, has_side.long().repeat(3))
-        for has_side in (side > 0, side < 0)
+        torch.zeros_like(keys).index_add(0, index, is_side.long().repeat(3))
+        for is_side in (area > 0, area < 0)
     )
     contour = keys[(num_front == 1) | (num_back == 1)]
     first = torch.div(contour, len(pixels), rounding_mode="floor")
     return torch.stack([first, contour - first * len(pixels)], dim=-1)
 
 
-def _nearest_edges(
-    segments: Float[Tensor, "edges 2 2"],
-    covered: Bool[Tensor, "padded_height padded_width"],
+def _split(
+    edges: Int[Tensor, "edges 2"], pixels: Float[Tensor, "vertices 2"], most: int
+) -> _Pieces:
+    """Pieces of at most one pixel, but at most so many of one edge."""
+    start, end = pixels[edges].unbind(1)
+    count = ((end - start).norm(dim=-1) / _LONGEST_PIECE).ceil().clamp(1, most).long()
+    edge, number = numbered_copies(count)
+    return _Pieces(
+        edges[edge],
+        number.to(pixels) / count[edge],
+        (number + 1).to(pixels) / count[edge],
+    )
+
+
+def _is_covered(
+    points: Float[Tensor, "points 2"],
+    corners: Float[Tensor, "faces 3 2"],
     margin: int,
+    width: int,
+    height: int,
+) -> Bool[Tensor, "points"]:
+    """Whether any face holds the point; points may lie outside the image by the margin.
+
+    Faces meet points through the pixel that both touch.
+    """
+    columns, rows = width + 2 * margin, height + 2 * margin
+    points, corners = points + margin, corners + margin
+    home = points.floor().long().clamp_min(0)
+    home = home[:, 1].clamp_max(rows - 1) * columns + home[:, 0].clamp_max(columns - 1)
+    by_home = home.argsort()
+    num_points = torch.bincount(home, minlength=rows * columns)
+    first_point = num_points.cumsum(0) - num_points
+    covered = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    lower, upper = corners.amin(1) - 0.5, corners.amax(1) + 0.5
+    for face, x, y in pixels_in_boxes(lower, upper, columns, rows):
+        pixel = y * columns + x
+        pair, rank = numbered_copies(num_points[pixel])
+        point = by_home[first_point[pixel[pair]] + rank]
+        _, holds = weights_in_image(corners[face[pair]], points[point])
+        covered[point[holds]] = True
+    return covered
+
+
+def _nearest_pieces(
+    outline: _Pieces,
+    pixels: Float[Tensor, "vertices 2"],
     radius: float,
     width: int,
     height: int,
 ) -> tuple[Int[Tensor, "pixels"], Int[Tensor, "pixels"]]:
-    """For each pixel within the radius of the outline, the edge that is nearest to it.
+    """For each pixel within the radius of the outline, the piece that is nearest to it.
 
     Returns:
-        Flat pixel indices, each once, and indices of edges.
+        Flat pixel indices, each once, and indices of pieces.
     """
-    nearest = torch.full(
-        (height * width,),
-        torch.iinfo(torch.int64).max,
-        dtype=torch.int64,
-        device=segments.device,
-    )
-    to_empty = _distance_to_empty(covered, margin, radius + _GRID_STEP)
-    lower, upper = segments.amin(1) - radius, segments.amax(1) + radius
-    for edge, x, y in pixels_in_boxes(lower, upper, width, height):
-        pixel = y * width + x
-        squared = _squared_distance(torch.stack([x, y], -1).to(segments) + 0.5, segments[edge])
-        # No outline lies much nearer than the nearest uncovered pixel: the edge is a hidden one.
-        hidden = squared < (to_empty[pixel] - _GRID_STEP).clamp_min(0).square()
-        kept = (squared <= radius**2) & ~hidden
-        key = (squared[kept].float().view(torch.int32).long() << 32) | edge[kept]
-        nearest.scatter_reduce_(0, pixel[kept], key, "amin")
-    pixel = (nearest != torch.iinfo(torch.int64).max).nonzero()[:, 0]
+    none = torch.iinfo(torch.int64).max
+    nearest = torch.full((height * width,), none, dtype=torch.int64, device=pixels.device)
+    corners = outline.corners(pixels)
+    lower, upper = corners.amin(1) - radius, corners.amax(1) + radius
+    for piece, x, y in pixels_in_boxes(lower, upper, width, height):
+        centers = torch.stack([x, y], dim=-1).to(pixels) + 0.5
+        squared = outline.squared_distance(piece, centers, pixels)
+        near = squared <= radius**2
+        # Positive floats order like their bits: one integer holds distance first, then the piece.
+        key = (squared[near].float().view(torch.int32).long() << 32) | piece[near]
+        nearest.scatter_reduce_(0, (y * width + x)[near], key, "amin")
+    pixel = (nearest != none).nonzero()[:, 0]
     return pixel, nearest[pixel] & 0xFFFFFFFF
-
-
-def _distance_to_empty(
-    covered: Bool[Tensor, "padded_height padded_width"], margin: int, limit: float
-) -> Float[Tensor, "pixels"]:
-    """Distance from each covered pixel to the nearest uncovered one, at most the limit."""
-    height, width = covered.shape[0] - 2 * margin, covered.shape[1] - 2 * margin
-    distance = torch.full((height, width), limit, device=covered.device)
-    reach = range(-math.floor(limit), math.floor(limit) + 1)
-    for step in ((x, y) for y in reach for x in reach if math.hypot(x, y) < limit):
-        top, left = margin + step[1], margin + step[0]
-        shifted = covered[top : top + height, left : left + width]
-        distance = torch.where(shifted, distance, distance.clamp_max(math.hypot(*step)))
-    return distance.reshape(-1)
-
-
-def _squared_distance(
-    points: Float[Tensor, "pairs 2"], segments: Float[Tensor, "pairs 2 2"]
-) -> Float[Tensor, "pairs"]:
-    """Squared distance of each point to its segment."""
-    start, end = segments.unbind(1)
-    along = end - start
-    length = along.square().sum(-1)
-    ratio = ((points - start) * along).sum(-1) / length.clamp_min(1e-12)
-    foot = start + ratio.clamp(0, 1)[:, None] * along
-    return (points - foot).square().sum(-1)

@@ -32,6 +32,7 @@ import safetensors.torch
 from safetensors import SafetensorError
 from torch import Tensor
 
+from handavatar.avatar import CheckpointError
 from handavatar.train.provenance import package_versions, source_commit
 
 Json = dict[str, Any]
@@ -45,10 +46,6 @@ _FILE_NAME = re.compile(r"[a-z][a-z0-9_]*\.(safetensors|json)")
 _MAX_MANIFEST_BYTES = 1 << 20
 
 _log = logging.getLogger(__name__)
-
-
-class CheckpointError(ValueError):
-    """A run, checkpoint or avatar file that cannot be used: the file, what is wrong, the remedy."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,419 @@
+"""The avatar: one box that turns a pose and a camera into pictures.
+
+``HandAvatar`` receives its parts ready-made: rig, shape offsets, occupancy field, albedo and
+illumination. ``prepare`` does what is needed once per pose, ``render_rays`` what is needed per
+ray; training and rendering go through the same two calls.
+"""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from safetensors import safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+
+from handavatar.edit import Edit
+from handavatar.field.anchors import Neighbours, nearest_anchors, place_anchors
+from handavatar.field.occupancy import HandCodes, PairItems, PairOccupancy
+from handavatar.field.shading import AlbedoField, IlluminationField, directed_occupancy
+from handavatar.field.shape import ShapeOffsets, personal_hand
+from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
+from handavatar.geometry.meshes import SurfacePoints, vertex_normals
+from handavatar.hand.detail import subdivided
+from handavatar.hand.parts import Parts, divide_into_parts
+from handavatar.hand.pose import HandPose
+from handavatar.hand.rig import PosedHand, Rig
+from handavatar.render.sampling import depths_along, intervals_through_boxes
+from handavatar.render.volume import composite_sparse, visibility
+
+SCHEMA = 1
+_RIG_TENSORS = (
+    "template_vertices",
+    "faces",
+    "skin_weights",
+    "joint_regressor",
+    "shape_directions",
+    "uv_coordinates",
+    "uv_faces",
+    "joint_axes",
+)
+
+
+class CheckpointError(ValueError):
+    """A file of weights that cannot be used: which, what is wrong with it, what to do."""
+
+
+@dataclass(frozen=True)
+class RenderSettings:
+    """How rays are evaluated.
+
+    Attributes:
+        num_samples: samples per ray (the paper's N^q).
+        smallest_weight: samples that weigh less in their pixel are not shaded; the error of a
+            pixel is at most the sum of what it skips.
+        stop: a ray ends where less than this share of light is left; the error is at most that.
+        group: samples evaluated at a time along the ray before it may end.
+        rays_at_once: bounds the memory.
+    """
+
+    num_samples: int = 64
+    smallest_weight: float = 1e-4
+    stop: float = 1e-4
+    group: int = 8
+    rays_at_once: int = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class HandState:
+    """Everything about one pose that all rays share.
+
+    Attributes:
+        posed: the personal hand in the world.
+        offsets: of its rest vertices, metres.
+        codes: for the occupancy field.
+        anchors: world positions of the anchors, metres.
+        anchor_normals: unit, world.
+    """
+
+    posed: PosedHand
+    offsets: Float[Tensor, "vertices 3"]
+    codes: HandCodes
+    anchors: Float[Tensor, "anchors 3"]
+    anchor_normals: Float[Tensor, "anchors 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class RayValues:
+    """What each ray sees. Channels that nothing covers are zero.
+
+    Attributes:
+        color: albedo times illumination, edits included, not clipped.
+        albedo: RGB in [0, 1], times alpha.
+        illumination: scalar, times alpha.
+        normal: world normals, times alpha.
+        depth: metres along the ray, times alpha.
+        alpha: share of the ray that the hand covers.
+    """
+
+    color: Float[Tensor, "rays 3"]
+    albedo: Float[Tensor, "rays 3"]
+    illumination: Float[Tensor, "rays"]
+    normal: Float[Tensor, "rays 3"]
+    depth: Float[Tensor, "rays"]
+    alpha: Float[Tensor, "rays"]
+
+
+@dataclass(frozen=True, eq=False)
+class Rendering:
+    """A rendered view on black; see :class:`RayValues` for the channels.
+
+    Colours are in the space of the capture's images (sRGB as stored, divided by 255).
+    """
+
+    color: Float[Tensor, "height width 3"]
+    albedo: Float[Tensor, "height width 3"]
+    illumination: Float[Tensor, "height width"]
+    normal: Float[Tensor, "height width 3"]
+    depth: Float[Tensor, "height width"]
+    alpha: Float[Tensor, "height width"]
+
+
+class HandAvatar(nn.Module):
+    """MANO-HD, PairOF and SelF, joined by volume rendering (paper Fig. 2)."""
+
+    coefficients: Tensor
+    anchor_corners: Tensor
+    anchor_barycentric: Tensor
+
+    def __init__(
+        self,
+        rig: Rig,
+        coefficients: Float[Tensor, "shapes"],
+        rounds: int = 2,
+        num_anchors: int = 4096,
+        anchors: SurfacePoints | None = None,
+        info: dict[str, Any] | None = None,
+    ) -> None:
+        """An untrained avatar.
+
+        Args:
+            rig: the base rig; it is subdivided here.
+            coefficients: shape coefficients of the person, zeros for the mean.
+            rounds: midpoint subdivisions (the paper's two).
+            num_anchors: the paper's N^a.
+            anchors: anchors to use instead of placing new ones (when loading).
+            info: facts that travel with the avatar (side, subject, method, ...).
+        """
+        super().__init__()
+        self.base_rig = rig
+        self.rounds = rounds
+        self.info: dict[str, Any] = dict(info or {})
+        self.rig = subdivided(rig, rounds)
+        self.parts: Parts = divide_into_parts(self.rig)
+        anchors = anchors or place_anchors(self.rig, num_anchors)
+        self.register_buffer("coefficients", coefficients.clone())
+        self.register_buffer("anchor_corners", anchors.faces)
+        self.register_buffer("anchor_barycentric", anchors.barycentric)
+        self.shape = ShapeOffsets()
+        self.occupancy = PairOccupancy()
+        self.albedo = AlbedoField(len(anchors.faces))
+        self.illumination = IlluminationField(anchors.positions(self.rig.template_vertices))
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.coefficients.device
+
+    def moved_to(self, device: torch.device | str) -> "HandAvatar":
+        """Moves weights, rig and parts; returns itself."""
+        self.to(device)
+        self.rig = self.rig.to(device)
+        self.parts = self.parts.to(device)
+        return self
+
+    def pose_hand(self, pose: HandPose) -> PosedHand:
+        """The personal mesh in a pose (paper Sec. 3.1)."""
+        rest = self.rig.shaped(self.coefficients)
+        return personal_hand(rest, self.shape(rest, pose.rotations)).posed(pose)
+
+    def prepare(self, pose: HandPose) -> HandState:
+        """Does once what all rays of a pose share."""
+        rest = self.rig.shaped(self.coefficients)
+        offsets = self.shape(rest, pose.rotations)
+        posed = personal_hand(rest, offsets).posed(pose)
+        anchors = SurfacePoints(self.anchor_corners, self.anchor_barycentric)
+        normals = vertex_normals(posed.vertices, self.rig.faces)
+        return HandState(
+            posed,
+            offsets,
+            self.occupancy.encode(self.parts, posed),
+            anchors.positions(posed.vertices),
+            torch.nn.functional.normalize(anchors.positions(normals), dim=-1),
+        )
+
+    def render_rays(
+        self,
+        state: HandState,
+        rays: Rays,
+        settings: RenderSettings,
+        generator: torch.Generator | None = None,
+        edit: Edit | None = None,
+    ) -> RayValues:
+        """Evaluates rays; with gradient where gradients are enabled.
+
+        The fields are first evaluated without gradient; the samples that can be seen are then
+        evaluated again with gradient, through the pairs alone that decide their occupancy. The
+        maximum sends no gradient elsewhere, so the gradient is that of the full evaluation up to
+        the samples that weigh less than ``settings.smallest_weight``.
+
+        Args:
+            state: of the pose.
+            rays: world rays.
+            settings: numbers of samples and bounds.
+            generator: jitters the samples (training); without it the result is deterministic.
+            edit: changes of the look.
+
+        Source: paper Sec. 3.3, Eq. 2, with Eq. 4 along the same samples.
+        """
+        num_rays = len(rays.origins)
+        boxes = state.codes.boxes
+        near, far, is_hit = intervals_through_boxes(
+            rays, boxes.bone_from_world, boxes.lower - boxes.margin, boxes.upper + boxes.margin
+        )
+        hit = is_hit.nonzero()[:, 0]
+        depths = depths_along(near[hit], far[hit], settings.num_samples, generator)
+        rays_hit = Rays(rays.origins[hit], rays.directions[hit])
+        weights, kept, directed = self._visible_samples(state, rays_hit, depths, settings)
+        ray, sample = kept.unbind(-1)
+        along = depths[ray, sample]
+        points = rays_hit.origins[ray] + along[:, None] * rays_hit.directions[ray]
+
+        neighbours = nearest_anchors(state.anchors, points)
+        albedo, illumination = self._shade(state, neighbours, directed, edit or Edit())
+        values = torch.cat(
+            [
+                albedo * illumination[:, None],
+                albedo,
+                illumination[:, None],
+                neighbours.interpolated(state.anchor_normals),
+                along[:, None],
+                torch.ones_like(along)[:, None],
+            ],
+            dim=-1,
+        )
+        total = composite_sparse(weights, hit[ray], values, num_rays)
+        color, albedo, light, normal, depth, alpha = total.split([3, 3, 1, 3, 1, 1], dim=-1)
+        return RayValues(color, albedo, light[:, 0], normal, depth[:, 0], alpha[:, 0])
+
+    def _shade(
+        self,
+        state: HandState,
+        neighbours: Neighbours,
+        directed: Float[Tensor, "queries bones"],
+        edit: Edit,
+    ) -> tuple[Float[Tensor, "queries 3"], Float[Tensor, "queries"]]:
+        albedo = edit.of_albedo(self.albedo(neighbours))
+        rotations = state.posed.pose.rotations
+        light = self.illumination(rotations, neighbours, edit.of_directed(directed))
+        return albedo, edit.of_illumination(light)
+
+    def _visible_samples(
+        self,
+        state: HandState,
+        rays: Rays,
+        depths: Float[Tensor, "rays samples"],
+        settings: RenderSettings,
+    ) -> tuple[Float[Tensor, "kept"], Int[Tensor, "kept 2"], Float[Tensor, "kept bones"]]:
+        """Weights of the samples that can be seen, which they are, and what lies before them."""
+        num_rays, num_samples = depths.shape
+        occupancy, soft, items = self._march(state, rays, depths, settings)
+        is_kept = visibility(occupancy) > settings.smallest_weight
+        kept = is_kept.nonzero()
+        directed = directed_occupancy(soft)[is_kept]
+        if torch.is_grad_enabled():
+            position = torch.full((num_rays * num_samples,), -1, device=depths.device)
+            position[is_kept.flatten()] = torch.arange(len(kept), device=depths.device)
+            item_position = position[items.points]
+            is_used = item_position >= 0
+            used = PairItems(item_position[is_used], items.pairs[is_used], items.is_wanted[is_used])
+            ray, sample = kept.unbind(-1)
+            points = rays.origins[ray] + depths[ray, sample][:, None] * rays.directions[ray]
+            again = self.occupancy.of_items(state.codes, points, used)
+            occupancy = occupancy.index_put((ray, sample), again)
+        return visibility(occupancy)[is_kept], kept, directed
+
+    def _march(
+        self,
+        state: HandState,
+        rays: Rays,
+        depths: Float[Tensor, "rays samples"],
+        settings: RenderSettings,
+    ) -> tuple[Float[Tensor, "rays samples"], Float[Tensor, "rays samples bones"], PairItems]:
+        """Occupancies front to back, without gradient; a ray ends where it is dark."""
+        num_rays, num_samples = depths.shape
+        occupancy = torch.zeros_like(depths)
+        soft = depths.new_zeros(num_rays, num_samples, state.codes.boxes.lower.shape[0])
+        light = depths.new_ones(num_rays)
+        alive = torch.arange(num_rays, device=depths.device)
+        found: list[PairItems] = []
+        for start in range(0, num_samples, settings.group):
+            window = torch.arange(start, min(start + settings.group, num_samples)).to(alive)
+            flat = (alive[:, None] * num_samples + window).flatten()
+            along = depths[alive][:, window]
+            points = (
+                rays.origins[alive][:, None] + along[..., None] * rays.directions[alive][:, None]
+            )
+            result = self.occupancy(state.codes, points.flatten(0, 1))
+            occupancy.view(-1)[flat] = result.whole
+            soft.view(-1, soft.shape[-1])[flat] = result.soft_parts
+            found.append(replace(result.items, points=flat[result.items.points]))
+            light[alive] *= (1 - result.whole.view(len(alive), -1)).prod(1)
+            alive = alive[light[alive] > settings.stop]
+            if len(alive) == 0:
+                break
+        items = PairItems(
+            torch.cat([part.points for part in found]),
+            torch.cat([part.pairs for part in found]),
+            torch.cat([part.is_wanted for part in found]),
+        )
+        return occupancy, soft, items
+
+    @torch.no_grad()
+    def render(
+        self,
+        pose: HandPose,
+        camera: Camera,
+        edit: Edit | None = None,
+        settings: RenderSettings | None = None,
+    ) -> Rendering:
+        """A whole picture, on black, without gradient; deterministic.
+
+        Args:
+            pose: of the hand in the world.
+            camera: decides the size of the picture.
+            edit: changes of the look.
+            settings: samples and bounds.
+        """
+        settings = settings or RenderSettings()
+        state = self.prepare(pose.to(self.device))
+        camera = camera.to(self.device)
+        rays = rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1))
+        pieces = []
+        for start in range(0, len(rays.origins), settings.rays_at_once):
+            window = slice(start, start + settings.rays_at_once)
+            part = Rays(rays.origins[window], rays.directions[window])
+            pieces.append(self.render_rays(state, part, settings, edit=edit))
+        size = (camera.height, camera.width)
+        return Rendering(
+            **{
+                name: torch.cat([getattr(piece, name) for piece in pieces]).unflatten(0, size)
+                for name in RayValues.__dataclass_fields__
+            }
+        )
+
+    def save(self, path: Path) -> None:
+        """Writes one safetensors file, aside first, then renamed into place."""
+        tensors = {f"rig.{name}": getattr(self.base_rig, name) for name in _RIG_TENSORS}
+        tensors |= {f"set.{name}": value for name, value in self.base_rig.vertex_sets.items()}
+        tensors |= {f"avatar.{name}": value for name, value in self.state_dict().items()}
+        about = {
+            "schema": SCHEMA,
+            "rig": self.base_rig.name,
+            "rig_sha256": self.base_rig.sha256,
+            "rounds": self.rounds,
+            "margin": self.occupancy.margin,
+            "softness": self.occupancy.softness,
+            "info": self.info,
+        }
+        path.parent.mkdir(parents=True, exist_ok=True)
+        aside = path.with_name(path.name + ".tmp")
+        stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+        save_file(stored, aside, {"handavatar": json.dumps(about)})
+        aside.replace(path)
+
+    @staticmethod
+    def load(path: Path | str) -> "HandAvatar":
+        """Reads an avatar back.
+
+        Raises:
+            CheckpointError: if the file is missing, damaged, or not an avatar of this schema.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise CheckpointError(f"{path}: no such file; train an avatar or name an existing one")
+        try:
+            with safe_open(path, framework="pt") as file:
+                about = json.loads((file.metadata() or {}).get("handavatar", "null"))
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        except Exception as error:
+            raise CheckpointError(
+                f"{path}: cannot be read as safetensors ({error}); the file is damaged or not "
+                "complete: copy it again or take it from the run's last checkpoint"
+            ) from error
+        if not isinstance(about, dict) or about.get("schema") != SCHEMA:
+            raise CheckpointError(
+                f"{path}: not an avatar of schema {SCHEMA}; train it again with this version"
+            )
+        try:
+            sets = {name[4:]: value for name, value in tensors.items() if name.startswith("set.")}
+            arrays = {name: tensors[f"rig.{name}"] for name in _RIG_TENSORS}
+            rig = Rig(name=about["rig"], vertex_sets=sets, **arrays)
+            state = {name[7:]: v for name, v in tensors.items() if name.startswith("avatar.")}
+            anchors = SurfacePoints(state["anchor_corners"], state["anchor_barycentric"])
+            avatar = HandAvatar(
+                rig,
+                state["coefficients"],
+                rounds=about["rounds"],
+                anchors=anchors,
+                info=about["info"],
+            )
+            avatar.occupancy.margin = about["margin"]
+            avatar.occupancy.softness = about["softness"]
+            avatar.load_state_dict(state)
+        except (KeyError, RuntimeError, TypeError, ValueError) as error:
+            raise CheckpointError(f"{path}: not a complete avatar ({error})") from error
+        return avatar

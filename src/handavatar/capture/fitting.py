@@ -1,0 +1,480 @@
+"""The rig laid onto tracked landmarks and outlines: one hand shape, a pose for every frame.
+
+All frames are fitted at once, in camera axes (OpenCV, the camera's centre as origin, metres).
+First the landmarks alone decide; then the mesh's outline is drawn to the mask's, pair by pair.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from handavatar.hand.pose import FINGER_BONES, HandPose, bone_transforms, linear_blend_skinning
+from handavatar.hand.pose_sampling import (
+    angles_from_rotations,
+    gesture_rotations,
+    limit_excess,
+    rotations_from_angles,
+)
+from handavatar.hand.rig import Rig
+
+_FINGERS = ("thumb", "index", "middle", "ring", "little")
+_PALM_LANDMARKS = (0, 1, 5, 9, 13, 17)
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How the hand is fitted; errors are those expected of what is observed."""
+
+    focal_share: float = 1.0
+    """Focal length over the longer side of the picture: phones and webcams have 0.75 to 1.2."""
+    focal_tolerance: float = 0.1
+    """Standard deviation of the logarithm of the focal length."""
+    landmark_error: float = 0.004
+    """Metres by which a tracked landmark is off, beside what the tracker itself admits."""
+    outline_error: float = 0.0015
+    """Metres between the outlines of mesh and mask in a good fit."""
+    acceleration: float = 0.012
+    """Metres a landmark strays from even motion between two frames."""
+    landmark_steps: int = 250
+    """Steps of the first stage."""
+    outline_steps: int = 240
+    """Steps of the second stage."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """What was seen of a right hand in some frames of one video.
+
+    Attributes:
+        landmarks: pixels of the picture, in the tracker's order.
+        uncertainty: of each landmark, pixels.
+        world_landmarks: metres about the hand's centre, camera axes, of the tracker's mean hand.
+        scale: picture pixels per metre at the hand.
+        times: seconds.
+        picture_size: width and height, pixels.
+    """
+
+    landmarks: Float[Tensor, "frames 21 2"]
+    uncertainty: Float[Tensor, "frames 21"]
+    world_landmarks: Float[Tensor, "frames 21 3"]
+    scale: Float[Tensor, "frames"]
+    times: Float[Tensor, "frames"]
+    picture_size: tuple[int, int]
+
+    def chosen(self, frames: Int[Tensor, "chosen"]) -> "Observations":
+        """The same of some frames; they may repeat."""
+        return Observations(
+            self.landmarks[frames],
+            self.uncertainty[frames],
+            self.world_landmarks[frames],
+            self.scale[frames],
+            self.times[frames],
+            self.picture_size,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class HandFit:
+    """A hand in every frame, in camera axes.
+
+    Attributes:
+        rotations: as in :class:`HandPose`.
+        translation: as in :class:`HandPose`, metres.
+        shape_coefficients: of the rig.
+        log_focal: natural logarithm of the focal length in pixels.
+        offsets: from the rig's joints and fingertips to what the tracker means by its landmarks,
+            metres in the rest axes of the bone.
+    """
+
+    rotations: Float[Tensor, "frames bones 3"]
+    translation: Float[Tensor, "frames 3"]
+    shape_coefficients: Float[Tensor, "shapes"]
+    log_focal: Float[Tensor, ""]
+    offsets: Float[Tensor, "21 3"]
+
+    @property
+    def focal(self) -> float:
+        """Focal length, pixels."""
+        return float(self.log_focal.exp())
+
+    def pose(self, frame: int) -> HandPose:
+        """The pose in one frame, wrist rotation brought to at most half a turn."""
+        rotations = axis_angle_from_matrix(matrix_from_axis_angle(self.rotations[frame]))
+        return HandPose(rotations, self.translation[frame])
+
+    def chosen(self, frames: Int[Tensor, "chosen"]) -> "HandFit":
+        """The same of some frames; they may repeat."""
+        return replace(self, rotations=self.rotations[frames], translation=self.translation[frames])
+
+
+@dataclass(frozen=True, eq=False)
+class OutlinePairs:
+    """Vertices and the image points at which they ought to be seen.
+
+    Attributes:
+        vertices: indices.
+        targets: pixels of the picture.
+        normals: unit normals of the outline there; along it a vertex may slide.
+        weights: 0 where a place in the array is not used.
+    """
+
+    vertices: Int[Tensor, "frames pairs"]
+    targets: Float[Tensor, "frames pairs 2"]
+    normals: Float[Tensor, "frames pairs 2"]
+    weights: Float[Tensor, "frames pairs"]
+
+
+PairFinder = Callable[[Float[Tensor, "frames vertices 3"], float], OutlinePairs]
+"""Pairs for posed vertices (metres, camera axes) and a focal length (pixels)."""
+
+
+class HandModel:
+    """A rig as the fit needs it: landmarks and single vertices, linear in the shape."""
+
+    def __init__(self, rig: Rig) -> None:
+        """Precomputes what is linear in the shape.
+
+        Args:
+            rig: with a vertex set ``fingertips`` (thumb to little).
+        """
+        self.rig = rig
+        tips = rig.vertex_sets["fingertips"]
+        bones, rows = [0], [0]
+        for finger, _ in zip(_FINGERS, tips, strict=True):
+            chain = FINGER_BONES[finger]
+            bones += [*chain, chain[-1]]
+            rows += [*chain, 16 + _FINGERS.index(finger)]
+        self.landmark_bones = torch.tensor(bones)
+        joint_directions = torch.einsum("bv,vcs->bcs", rig.joint_regressor, rig.shape_directions)
+        points = torch.cat(
+            [rig.joint_regressor @ rig.template_vertices, rig.template_vertices[tips]]
+        )
+        directions = torch.cat([joint_directions, rig.shape_directions[tips]])
+        self._joints, self._joint_directions = points[:16], joint_directions
+        self._landmarks, self._landmark_directions = points[rows], directions[rows]
+        sizes = {"cmc": 0.008, "mcp": 0.006, "tip": 0.004}
+        parts = ["wrist"] + ["cmc", "mcp", "ip", "tip"] + ["mcp", "pip", "dip", "tip"] * 4
+        self.offset_tolerance = torch.tensor([sizes.get(part, 0.003) for part in parts])
+        self.offset_tolerance[0] = 0.010
+
+    def joints(self, shape: Float[Tensor, "shapes"]) -> Float[Tensor, "16 3"]:
+        """Rest joints, metres."""
+        return self._joints + self._joint_directions @ shape
+
+    def landmarks(self, fit: HandFit) -> Float[Tensor, "frames 21 3"]:
+        """Where the tracker's landmarks are on the hand: metres, camera axes."""
+        joints = self.joints(fit.shape_coefficients)
+        transforms = bone_transforms(fit.rotations, joints)[:, self.landmark_bones]
+        rest = self._landmarks + self._landmark_directions @ fit.shape_coefficients + fit.offsets
+        local = rest - joints[self.landmark_bones]
+        turned = (transforms[..., :3, :3] @ local[..., None])[..., 0]
+        return turned + transforms[..., :3, 3] + fit.translation[:, None]
+
+    def vertices(
+        self, fit: HandFit, chosen: Int[Tensor, "frames pairs"]
+    ) -> Float[Tensor, "frames pairs 3"]:
+        """Single posed vertices of every frame: metres, camera axes."""
+        rig, shape = self.rig, fit.shape_coefficients
+        joints = self.joints(shape)
+        transforms = bone_transforms(fit.rotations, joints)
+        rotation = transforms[..., :3, :3]
+        shift = transforms[..., :3, 3] - (rotation @ joints[..., None])[..., 0]
+        motion = torch.cat([rotation.flatten(-2), shift], dim=-1)
+        per_vertex = rig.skin_weights[chosen] @ motion
+        rest = (rig.template_vertices + rig.shape_directions @ shape)[chosen]
+        blended = per_vertex[..., :9].unflatten(-1, (3, 3))
+        return (blended @ rest[..., None])[..., 0] + per_vertex[..., 9:] + fit.translation[:, None]
+
+    @torch.no_grad()
+    def all_vertices(self, fit: HandFit) -> Float[Tensor, "frames vertices 3"]:
+        """All posed vertices: metres, camera axes."""
+        joints = self.joints(fit.shape_coefficients)
+        rest = self.rig.template_vertices + self.rig.shape_directions @ fit.shape_coefficients
+        frames = len(fit.rotations)
+        posed = linear_blend_skinning(
+            rest.expand(frames, -1, -1),
+            self.rig.skin_weights,
+            bone_transforms(fit.rotations, joints),
+            joints.expand(frames, -1, -1),
+        )
+        return posed + fit.translation[:, None]
+
+
+def projected(
+    points: Float[Tensor, "*n 3"], focal: Float[Tensor, ""], picture_size: tuple[int, int]
+) -> Float[Tensor, "*n 2"]:
+    """Pixels of points in camera axes; the principal point is the picture's centre."""
+    center = points.new_tensor(picture_size) / 2
+    return points[..., :2] / points[..., 2:].clamp_min(0.02) * focal + center
+
+
+def fit_hands(
+    rig: Rig,
+    observations: Observations,
+    options: FitOptions,
+    find_pairs: PairFinder | None = None,
+) -> HandFit:
+    """Shape, focal length, and the pose of every frame.
+
+    Args:
+        rig: any rig with fingertips.
+        observations: of one right hand.
+        options: expected errors, steps.
+        find_pairs: correspondences of outlines; without it landmarks alone decide.
+    """
+    model = HandModel(rig)
+    fit = initial_fit(model, observations, options)
+    fit = refined(model, observations, fit, options, steps=options.landmark_steps)
+    if find_pairs is not None:
+        fit = refined(
+            model, observations, fit, options, steps=options.outline_steps, find_pairs=find_pairs
+        )
+    return fit
+
+
+def initial_fit(model: HandModel, observations: Observations, options: FitOptions) -> HandFit:
+    """Poses from the tracker's own 3D landmarks, placed where the 2D ones say."""
+    frames = len(observations.landmarks)
+    focal = options.focal_share * max(observations.picture_size)
+    num_shapes = model.rig.shape_directions.shape[-1]
+    rotations = gesture_rotations(model.rig, "relaxed").repeat(frames, 1, 1)
+    fit = HandFit(
+        rotations,
+        torch.zeros(frames, 3),
+        torch.zeros(num_shapes),
+        torch.tensor(math.log(focal)),
+        torch.zeros(21, 3),
+    )
+    seen = observations.world_landmarks
+    palm = list(_PALM_LANDMARKS)
+    turn = _aligning_rotation(model.landmarks(fit)[:, palm], seen[:, palm])
+    fit.rotations[:, 0] = axis_angle_from_matrix(turn)
+    fit = _fitted_to_world_landmarks(model, fit, seen)
+    return placed(model, observations, fit)
+
+
+def placed(model: HandModel, observations: Observations, fit: HandFit) -> HandFit:
+    """The same poses, moved (not turned) to where the 2D landmarks are; least squares."""
+    center = torch.tensor(observations.picture_size) / 2
+    points = model.landmarks(replace(fit, translation=torch.zeros_like(fit.translation)))
+    rays = (observations.landmarks - center) / fit.log_focal.exp()
+    one, zero = torch.ones_like(rays[..., 0]), torch.zeros_like(rays[..., 0])
+    rows = torch.cat(
+        [torch.stack([one, zero, -rays[..., 0]], -1), torch.stack([zero, one, -rays[..., 1]], -1)],
+        dim=1,
+    )
+    flat = rays * points[..., 2:] - points[..., :2]
+    right_side = torch.cat([flat[..., 0], flat[..., 1]], dim=1)
+    translation = torch.linalg.lstsq(rows, right_side[..., None]).solution[..., 0]
+    nearest = 0.08 - points[..., 2].amin(1)
+    depth = torch.maximum(translation[:, 2], nearest)
+    return replace(fit, translation=torch.cat([translation[:, :2], depth[:, None]], dim=1))
+
+
+def refined(
+    model: HandModel,
+    observations: Observations,
+    fit: HandFit,
+    options: FitOptions,
+    *,
+    steps: int,
+    find_pairs: PairFinder | None = None,
+    learns_shape: bool = True,
+) -> HandFit:
+    """Descends the whole energy from a given fit.
+
+    Args:
+        model: the hand.
+        observations: one row per frame.
+        fit: where to start.
+        options: expected errors.
+        steps: of Adam.
+        find_pairs: called every 15 steps for new correspondences of outlines.
+        learns_shape: whether shape, focal length and offsets move, and frames are successive;
+            otherwise every frame stands alone.
+    """
+    free = replace(
+        fit,
+        rotations=fit.rotations.clone().requires_grad_(),
+        translation=fit.translation.clone().requires_grad_(),
+    )
+    groups = [{"params": [free.rotations], "lr": 0.02}, {"params": [free.translation], "lr": 0.003}]
+    if learns_shape:
+        free = replace(
+            free,
+            shape_coefficients=fit.shape_coefficients.clone().requires_grad_(),
+            log_focal=fit.log_focal.clone().requires_grad_(),
+            offsets=fit.offsets.clone().requires_grad_(),
+        )
+        groups += [
+            {"params": [free.shape_coefficients], "lr": 0.03},
+            {"params": [free.log_focal], "lr": 0.002},
+            {"params": [free.offsets], "lr": 0.0004},
+        ]
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.98))
+    schedule = torch.optim.lr_scheduler.LambdaLR(
+        optimizer, lambda step: 0.05 + 0.95 * math.cos(0.5 * math.pi * step / steps)
+    )
+    pairs = None
+    for step in range(steps):
+        if find_pairs is not None and step % 15 == 0:
+            pairs = find_pairs(model.all_vertices(free), float(free.log_focal.detach().exp()))
+        optimizer.zero_grad()
+        energy = _frame_energy(model, observations, free, options, pairs).sum()
+        if learns_shape:
+            energy = energy + _shared_energy(model, observations, free, options)
+        energy.backward()
+        optimizer.step()
+        schedule.step()
+    return HandFit(
+        free.rotations.detach(),
+        free.translation.detach(),
+        free.shape_coefficients.detach(),
+        free.log_focal.detach(),
+        free.offsets.detach(),
+    )
+
+
+@torch.no_grad()
+def frame_energy(
+    model: HandModel,
+    observations: Observations,
+    fit: HandFit,
+    options: FitOptions,
+    find_pairs: PairFinder,
+) -> Float[Tensor, "frames"]:
+    """How badly each frame is explained, in the unit of :func:`refined`."""
+    pairs = find_pairs(model.all_vertices(fit), fit.focal)
+    return _frame_energy(model, observations, fit, options, pairs)
+
+
+@torch.no_grad()
+def landmark_errors(
+    model: HandModel, observations: Observations, fit: HandFit
+) -> Float[Tensor, "frames"]:
+    """Mean distance of fitted and tracked landmarks in every frame, pixels."""
+    seen = projected(model.landmarks(fit), fit.log_focal.exp(), observations.picture_size)
+    return (seen - observations.landmarks).norm(dim=-1).mean(-1)
+
+
+def _frame_energy(
+    model: HandModel,
+    observations: Observations,
+    fit: HandFit,
+    options: FitOptions,
+    pairs: OutlinePairs | None,
+) -> Float[Tensor, "frames"]:
+    """What each frame's own observations and the limits of its joints say."""
+    focal = fit.log_focal.exp()
+    landmarks = model.landmarks(fit)
+    apart = projected(landmarks, focal, observations.picture_size) - observations.landmarks
+    expected = torch.hypot(
+        observations.uncertainty, options.landmark_error * observations.scale[:, None]
+    )
+    energy = _robust(apart.norm(dim=-1) / expected).sum(-1)
+    # The tracker's depths are poor, but they tell towards and away.
+    seen_depth = observations.world_landmarks[..., 2]
+    depth = landmarks[..., 2] - landmarks[..., 2].mean(-1, keepdim=True)
+    seen_depth = seen_depth - seen_depth.mean(-1, keepdim=True)
+    energy = energy + 0.5 * _robust((depth - seen_depth) / 0.020).sum(-1)
+    energy = energy + _pose_energy(model.rig, fit.rotations)
+    if pairs is not None:
+        energy = energy + _outline_energy(model, observations, fit, options, pairs)
+    return energy
+
+
+def _outline_energy(
+    model: HandModel,
+    observations: Observations,
+    fit: HandFit,
+    options: FitOptions,
+    pairs: OutlinePairs,
+) -> Float[Tensor, "frames"]:
+    points = model.vertices(fit, pairs.vertices)
+    seen = projected(points, fit.log_focal.exp(), observations.picture_size)
+    apart = seen - pairs.targets
+    across = (apart * pairs.normals).sum(-1)
+    along = apart[..., 0] * pairs.normals[..., 1] - apart[..., 1] * pairs.normals[..., 0]
+    expected = (options.outline_error * observations.scale[:, None]).clamp_min(1.0)
+    terms = _robust((across.square() + 0.02 * along.square() + 1e-9).sqrt() / expected)
+    share = (terms * pairs.weights).sum(-1) / pairs.weights.sum(-1).clamp_min(1.0)
+    # Neighbouring outline points err together: all of them weigh as much as two dozen.
+    return 24 * share
+
+
+def _pose_energy(rig: Rig, rotations: Float[Tensor, "frames bones 3"]) -> Float[Tensor, "frames"]:
+    """Joint limits, and mild habits: little twist, end joints that follow the middle ones."""
+    excess = limit_excess(rig, rotations)[:, 1:]
+    energy = (excess / math.radians(4)).square().sum(-1)
+    angles = angles_from_rotations(rig, rotations)
+    flexion = angles[..., 0]
+    for finger in _FINGERS[1:]:
+        _, middle, last = FINGER_BONES[finger]
+        follows = flexion[:, last] - 0.55 * flexion[:, middle]
+        energy = energy + 0.5 * (follows / math.radians(15)).square()
+    return energy + 0.5 * (angles[:, 1:] / math.radians(60)).square().sum((-1, -2))
+
+
+def _shared_energy(
+    model: HandModel, observations: Observations, fit: HandFit, options: FitOptions
+) -> Float[Tensor, ""]:
+    """Priors of shape, focal length and offsets, and even motion in time."""
+    prior_focal = math.log(options.focal_share * max(observations.picture_size))
+    frames = len(fit.rotations)
+    # The frames share their errors (one tracker, one rig): the priors weigh with their number.
+    priors = (
+        fit.shape_coefficients.square().sum()
+        + (fit.offsets / model.offset_tolerance[:, None]).square().sum()
+        + ((fit.log_focal - prior_focal) / options.focal_tolerance).square()
+    )
+    energy = 0.1 * frames * priors
+    if frames < 3:
+        return energy
+    landmarks = model.landmarks(fit)
+    gaps = observations.times.diff()
+    is_even = (gaps[1:] < 1.6 * gaps.median()) & (gaps[:-1] < 1.6 * gaps.median())
+    bend = (landmarks[2:] - 2 * landmarks[1:-1] + landmarks[:-2]) / options.acceleration
+    return energy + 0.5 * (_robust(bend.norm(dim=-1)).sum(-1) * is_even).sum()
+
+
+def _robust(ratio: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Squared below 1, then like a logarithm: outliers lose their pull."""
+    return torch.log1p(0.5 * ratio.square()) * 2
+
+
+def _aligning_rotation(
+    source: Float[Tensor, "frames points 3"], target: Float[Tensor, "frames points 3"]
+) -> Float[Tensor, "frames 3 3"]:
+    """The rotation that best lays ``source`` on ``target``, both about their means."""
+    source = source - source.mean(1, keepdim=True)
+    target = target - target.mean(1, keepdim=True)
+    u, _, v = torch.linalg.svd(target.transpose(-1, -2) @ source)
+    sign = torch.ones(len(source), 3)
+    sign[:, 2] = torch.linalg.det(u @ v)
+    return (u * sign[:, None]) @ v
+
+
+def _fitted_to_world_landmarks(
+    model: HandModel, fit: HandFit, seen: Float[Tensor, "frames 21 3"]
+) -> HandFit:
+    """Joint rotations by the tracker's 3D landmarks, whose hand is brought to the rig's size."""
+    palm = list(_PALM_LANDMARKS)
+    seen = seen - seen[:, palm].mean(1, keepdim=True)
+    rest = model.landmarks(fit)
+    size = (rest[:, palm] - rest[:, palm].mean(1, keepdim=True)).norm(dim=-1).mean(1)
+    seen = seen * (size / seen[:, palm].norm(dim=-1).mean(1))[:, None, None]
+    rotations = fit.rotations.clone().requires_grad_()
+    optimizer = torch.optim.Adam([rotations], lr=0.05)
+    for _ in range(80):
+        optimizer.zero_grad()
+        points = model.landmarks(replace(fit, rotations=rotations))
+        points = points - points[:, palm].mean(1, keepdim=True)
+        energy = _robust((points - seen).norm(dim=-1) / 0.010).sum()
+        (energy + _pose_energy(model.rig, rotations).sum()).backward()
+        optimizer.step()
+    return replace(fit, rotations=rotations.detach())

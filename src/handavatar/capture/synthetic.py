@@ -1,0 +1,385 @@
+"""Made captures: a subject that never lived, path traced, with everything about it known.
+
+A subject is the open hand with its own shape coefficients, its own displacement of the surface (up
+to a few millimetres that no shape coefficient can express) and its own painted skin. It moves in
+front of a camera that stands still; each frame is the square part of the picture around the hand.
+Light comes mostly from one side.
+
+The truth beside the frames lies in ``truth/`` in the same stored space as the pictures, sRGB / 255:
+
+* ``albedo/``: colour of the skin, 8 bit.
+* ``shading/``: grey, 8 bit, 255 is 1: the factor ``s`` per pixel for which ``s * albedo`` comes
+  nearest to the picture. The sRGB curve is almost a power law, for which picture = albedo times
+  shading holds in the stored space if it holds for light; what is left is the curve's toe and
+  light that was coloured by bouncing off skin (about 1/255 in the mean).
+* ``depth/``: 16 bit, units of 0.1 mm along the optical axis, 0 is background.
+* ``normals/``: 8 bit, ``(n + 1) / 2``, world axes.
+* ``subject.safetensors``: rest vertices of the subject and of the hand with the same coefficients
+  but without the displacement, on the rig subdivided as ``truth.json`` says; shape coefficients.
+* ``truth.json``: all options and the seed.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from safetensors.torch import save_file
+from torch import Tensor
+
+from handavatar.capture.frames import Capture, CaptureWriter, Frame, read_capture
+from handavatar.capture.motion import Motion, gesture, placed
+from handavatar.capture.pathtracer import (
+    HandTracer,
+    Lights,
+    SurfaceMaps,
+    Traced,
+    Variant,
+    srgb_from_linear,
+)
+from handavatar.capture.skin import SkinOptions, paint_skin, smooth_noise
+from handavatar.geometry.cameras import Camera, look_at, project
+from handavatar.geometry.meshes import uniform_laplacian, unique_edges, vertex_normals
+from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.hand.detail import subdivided
+from handavatar.hand.open_hand import load_open_hand
+from handavatar.hand.pose import FINGER_BONES
+from handavatar.hand.pose_sampling import (
+    interpolate_rotations,
+    resolve_penetration,
+    sample_poses,
+)
+from handavatar.hand.rig import Rig
+
+TRAINING_GESTURES = (
+    "relaxed",
+    "spread",
+    "loose_fist",
+    "fist",
+    "point",
+    "victory",
+    "pinch",
+    "thumb_to_middle",
+    "thumb_to_little",
+    "flat",
+    "wave_low",
+    "hook",
+    "table",
+    "thumbs_up",
+    "claw",
+    "ok",
+    "wave_high",
+    "four",
+)
+TEST_GESTURES = ("thumb_to_ring", "three", "gun", "purse", "horns", "shaka", "little_out")
+_CAMERA_DISTANCE = 0.6
+_CENTER = (-0.09, 0.0, 0.0)
+_CROP_MARGIN = 1.3
+_BACKGROUND = 0.17
+
+
+@dataclass(frozen=True)
+class SynthOptions:
+    """A made capture."""
+
+    train_frames: int = 80
+    """frames of the training motion"""
+    test_frames: int = 20
+    """frames of another motion through other poses"""
+    size: int = 256
+    """width and height of the pictures, pixels"""
+    samples: int = 128
+    """light paths per pixel"""
+    seed: int = 7
+    """subject, skin and motion"""
+    tone: float = 0.4
+    """skin: 0 very light to 1 very dark"""
+    personal: float = 1.0
+    """strength of the displacement that shape coefficients cannot express"""
+    subdivisions: int = 2
+    """rounds that refine the rig before it is displaced and rendered"""
+    texture: int = 1024
+    """texels along each side of the skin texture"""
+    full_truth: bool = True
+    """store depth and normals too, not only albedo and shading"""
+    variant: Variant = "auto"
+    """of Mitsuba; auto takes llvm_ad_rgb where it works"""
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A hand that is fully known.
+
+    Attributes:
+        rig: the refined open hand.
+        shape_coefficients: standard deviations.
+        plain_vertices: rest hand of these coefficients, metres.
+        rest_vertices: the same with the personal displacement, metres.
+        texture: albedo, sRGB in [0, 1].
+    """
+
+    rig: Rig
+    shape_coefficients: Float[Tensor, "shapes"]
+    plain_vertices: Float[Tensor, "vertices 3"]
+    rest_vertices: Float[Tensor, "vertices 3"]
+    texture: Float[Tensor, "rows columns 3"]
+
+    def posed_vertices(self, motion: Motion, step: int) -> Float[Tensor, "vertices 3"]:
+        """Skin in the world. The joints are those of the shape coefficients."""
+        shaped = self.rig.shaped(self.shape_coefficients)
+        return replace(shaped, rest_vertices=self.rest_vertices).posed(motion.pose(step)).vertices
+
+
+def make_capture(
+    folder: Path,
+    options: SynthOptions,
+    overwrite: bool = False,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> Capture:
+    """Renders a made capture into a folder.
+
+    Args:
+        folder: where the capture is to be.
+        options: subject, motion and quality.
+        overwrite: replace a capture that is there.
+        on_progress: called with frames done and frames in total.
+
+    Raises:
+        CaptureError: if Mitsuba is missing or the folder is in use.
+    """
+    base = load_open_hand()
+    subject = make_subject(subdivided(base, options.subdivisions), options)
+    motions = {
+        "train": training_motion(base, options.train_frames, options.seed),
+        "test": test_motion(base, options.test_frames, options.seed),
+    }
+    writer = CaptureWriter(
+        folder,
+        rig_name=base.name,
+        rig_sha256=base.sha256,
+        subject=f"made-{options.seed}",
+        source=f"handavatar capture synth, seed {options.seed}",
+        licence="CC0-1.0",
+        shape_coefficients=subject.shape_coefficients,
+        overwrite=overwrite,
+    )
+    total = options.train_frames + options.test_frames
+    with writer:
+        _write_subject(writer, subject, options)
+        pictures = []
+        for done, (frame, traced, maps) in enumerate(_frames(subject, motions, options), start=1):
+            writer.add(frame)
+            _write_truth(writer, frame, traced, maps, options.full_truth)
+            pictures.append(frame.image)
+            on_progress(done, total)
+        sheet = contact_sheet(pictures[:: max(1, total // 40)])
+        Image.fromarray(sheet.numpy()).save(writer.file("overview.png"))
+    return read_capture(folder)
+
+
+def make_subject(rig: Rig, options: SynthOptions) -> Subject:
+    """The subject of a seed: shape, displacement, skin."""
+    random = np.random.default_rng([options.seed, 11])
+    num_shapes = rig.shape_directions.shape[-1]
+    drawn = 0.7 * random.standard_normal(num_shapes)
+    coefficients = torch.from_numpy(drawn.clip(-1.4, 1.4)).float()
+    shaped = rig.shaped(coefficients)
+    plain = _rounded(rig, shaped.rest_vertices)
+    offsets = options.personal * _personal_displacement(rig, random)
+    normals = vertex_normals(plain, rig.faces)
+    texture = paint_skin(rig, SkinOptions(options.seed, options.tone), options.texture)
+    return Subject(
+        rig=rig,
+        shape_coefficients=coefficients,
+        plain_vertices=shaped.rest_vertices,
+        rest_vertices=plain + offsets[:, None] * normals,
+        texture=texture,
+    )
+
+
+def _rounded(
+    rig: Rig, vertices: Float[Tensor, "vertices 3"], rounds: int = 8
+) -> Float[Tensor, "vertices 3"]:
+    """Takes the facets off that midpoint subdivision leaves, without shrinking the hand."""
+    edges = unique_edges(rig.faces)
+    is_free = torch.ones(len(vertices), 1)
+    is_free[rig.rim] = 0
+    for _ in range(rounds):
+        # A smoothing step and a slightly larger step back (Taubin) act as a low pass.
+        for factor in (0.5, -0.53):
+            vertices = vertices + factor * is_free * uniform_laplacian(vertices, edges)
+    return vertices
+
+
+def _personal_displacement(rig: Rig, random: np.random.Generator) -> Float[Tensor, "vertices"]:
+    """Metres along the normal: build of joints, pads and palm, and smooth irregularity."""
+    places = rig.template_vertices.double().numpy() * 1000
+    shaped = rig.shaped()
+    joints = shaped.rest_joints.double().numpy() * 1000
+    dorsal = vertex_normals(rig.template_vertices, rig.faces)[:, 1].numpy()
+    back, front = dorsal.clip(0), (-dorsal).clip(0)
+
+    def bump(center: np.ndarray, radius: float) -> np.ndarray:
+        return np.exp(-0.5 * ((places - center) ** 2).sum(-1) / radius**2)
+
+    total = 0.75 * smooth_noise(places, np.full(3, 38.0), random)
+    total += 0.35 * smooth_noise(places, np.full(3, 15.0), random)
+    for first, second, third in FINGER_BONES.values():
+        total += random.normal(1.2, 0.5) * back * bump(joints[first], 7)
+        total += random.normal(0.8, 0.5) * bump(joints[second], 6)
+        total += random.normal(0.4, 0.3) * bump(joints[third], 5)
+        middle = (joints[second] + joints[third]) / 2
+        total += random.normal(-0.2, 0.4) * bump(middle, 6)
+    for center, radius, mean in (
+        ((-40, -25, 34), 15, 1.8),
+        ((-42, -20, -32), 16, 1.2),
+        ((-58, -20, -4), 13, -1.5),
+    ):
+        total += random.normal(mean, 0.6) * front * bump(np.array(center, float), radius)
+    # The wrist's rim stays where the rig has it.
+    total *= 1 - bump(joints[0], 12)
+    return torch.from_numpy(total.clip(-3.5, 3.5) / 1000).float()
+
+
+def training_motion(rig: Rig, steps: int, seed: int) -> Motion:
+    """Curling over the palm, thumb opposition and free poses while the hand turns all the way."""
+    generator = torch.Generator().manual_seed(seed)
+    free = sample_poses(rig, 10, generator)
+    keys = [gesture(rig, name) for name in TRAINING_GESTURES]
+    for index, pose in enumerate(free):
+        keys.insert(2 * index + 1, pose)
+    share = torch.linspace(0, 1, steps)
+    fingers = interpolate_rotations(torch.stack(keys), share * (len(keys) - 1))
+    # Palm side first, then through the thumb's edge to the back.
+    to_back = ((share - 0.5) / 0.1).clamp(0, 1)
+    yaw = 180 * to_back + 70 * _wave(share, 4.3, 0.1)
+    return _turning(rig, fingers, yaw, 32 * _wave(share, 2.6, 0.35), 28 * _wave(share, 5.2, 0.6))
+
+
+def test_motion(rig: Rig, steps: int, seed: int) -> Motion:
+    """Other gestures and poses than the training motion's, in similar orientations."""
+    generator = torch.Generator().manual_seed(seed + 1000)
+    free = sample_poses(rig, 4, generator)
+    keys = [gesture(rig, name) for name in TEST_GESTURES]
+    for index, pose in enumerate(free):
+        keys.insert(3 * index + 1, pose)
+    share = torch.linspace(0, 1, steps)
+    fingers = interpolate_rotations(torch.stack(keys), share * (len(keys) - 1))
+    yaw = 180 * ((share - 0.58) / 0.08).clamp(0, 1) + 55 * _wave(share, 3.1, 0.3)
+    return _turning(rig, fingers, yaw, 24 * _wave(share, 1.7, 0.8), 22 * _wave(share, 2.9, 0.2))
+
+
+def _wave(share: Tensor, cycles: float, phase: float) -> Tensor:
+    return torch.sin(2 * math.pi * (cycles * share + phase))
+
+
+def _turning(rig: Rig, fingers: Tensor, yaw: Tensor, pitch: Tensor, roll: Tensor) -> Motion:
+    """Places finger poses in front of the camera; angles in degrees.
+
+    Yaw turns about the forearm, pitch tilts towards the camera, roll leans to the side.
+    """
+    fingers = resolve_penetration(rig, fingers)
+    axes = torch.eye(3)
+    turn_x, turn_z, turn_y = (
+        matrix_from_axis_angle(angle.deg2rad()[:, None] * axis)
+        for angle, axis in ((yaw, axes[0]), (pitch, axes[2]), (roll, axes[1]))
+    )
+    share = torch.linspace(0, 1, len(fingers))
+    drift = 0.02 * torch.stack([_wave(share, c, c / 7) for c in (1.3, 1.9, 2.3)], dim=-1)
+    middle = torch.tensor(_CENTER) + drift
+    return placed(rig, fingers, turn_y @ turn_z @ turn_x, middle, fps=10.0)
+
+
+def crop_camera(points: Float[Tensor, "points 3"], size: int) -> Camera:
+    """The standing camera's view of the square around the hand, 1.3 times its box."""
+    eye = torch.tensor(_CENTER) - torch.tensor([0.0, _CAMERA_DISTANCE, 0.0])
+    upright = look_at(eye, torch.tensor(_CENTER), torch.tensor([-1.0, 0.0, 0.0]))
+    camera = Camera((1000.0, 1000.0), (0.0, 0.0), 1, 1, upright)
+    pixels, _ = project(camera, points)
+    low, high = pixels.min(0).values, pixels.max(0).values
+    side = _CROP_MARGIN * float((high - low).max())
+    left, top = ((low + high) / 2 - side / 2).tolist()
+    zoom = size / side
+    return Camera((1000 * zoom, 1000 * zoom), (-left * zoom, -top * zoom), size, size, upright)
+
+
+def _frames(
+    subject: Subject, motions: dict[str, Motion], options: SynthOptions
+) -> Iterator[tuple[Frame, Traced, SurfaceMaps]]:
+    tracer = HandTracer(
+        subject.rig, subject.texture, Lights(), _CENTER, options.size, options.variant
+    )
+    index, time = 0, 0.0
+    for split, motion in motions.items():
+        for step in range(len(motion)):
+            vertices = subject.posed_vertices(motion, step)
+            camera = crop_camera(vertices, options.size)
+            tracer.place(vertices, camera)
+            traced = tracer.trace(options.samples, seed=index)
+            maps = tracer.surface_maps()
+            # The flat background is put in after the fact: it lights nothing.
+            color = traced.color + (1 - traced.alpha[..., None]) * _BACKGROUND**2.2
+            frame = Frame(
+                name=f"{index:06d}",
+                image=_eight_bits(srgb_from_linear(color)),
+                mask=traced.alpha > 0.5,
+                camera=camera,
+                pose=motion.pose(step),
+                confidence=1.0,
+                split=split,
+                time=time,
+            )
+            yield frame, traced, maps
+            index, time = index + 1, time + 1 / motion.fps
+
+
+def _write_subject(writer: CaptureWriter, subject: Subject, options: SynthOptions) -> None:
+    arrays = {
+        "rest_vertices": subject.rest_vertices,
+        "plain_vertices": subject.plain_vertices,
+        "shape_coefficients": subject.shape_coefficients,
+    }
+    save_file(
+        {k: v.contiguous() for k, v in arrays.items()}, writer.file("truth/subject.safetensors")
+    )
+    facts = {"schema": 1, "options": asdict(options), "lights": asdict(Lights())}
+    writer.file("truth/truth.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
+
+
+def _write_truth(
+    writer: CaptureWriter, frame: Frame, traced: Traced, maps: SurfaceMaps, full: bool
+) -> None:
+    mask = frame.mask.float()
+    albedo = srgb_from_linear(maps.albedo) * mask[..., None]
+    # Light of the hand alone, without what the background adds to the pixels of its outline.
+    hand = srgb_from_linear(traced.color / traced.alpha.clamp(min=1e-6)[..., None])
+    shading = (hand * albedo).sum(-1) / albedo.square().sum(-1).clamp(min=1e-6) * mask
+
+    def save(kind: str, pixels: np.ndarray) -> None:
+        Image.fromarray(pixels).save(writer.file(f"truth/{kind}/{frame.name}.png"))
+
+    save("albedo", _eight_bits(albedo).numpy())
+    save("shading", _eight_bits(shading).numpy())
+    if full:
+        tenths = (maps.depth * 1e4 * mask).round().clamp(0, 65535)
+        save("depth", tenths.numpy().astype(np.uint16))
+        save("normals", _eight_bits((maps.normals + 1) / 2 * mask[..., None]).numpy())
+
+
+def _eight_bits(values: Tensor) -> Tensor:
+    return (values.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
+def contact_sheet(pictures: list[Tensor], columns: int = 8, cell: int = 160) -> Tensor:
+    """Pictures side by side, each shrunk to ``cell`` pixels, as one 8-bit picture."""
+    rows = math.ceil(len(pictures) / columns)
+    sheet = Image.new("RGB", (columns * cell, rows * cell))
+    for index, picture in enumerate(pictures):
+        small = Image.fromarray(picture.numpy()).resize((cell, cell), Image.Resampling.LANCZOS)
+        sheet.paste(small, (index % columns * cell, index // columns * cell))
+    return torch.from_numpy(np.array(sheet))

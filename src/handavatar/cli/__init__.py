@@ -1,0 +1,97 @@
+"""The command line: ``handavatar COMMAND ...``.
+
+Commands import what they need when they run, so that ``--help`` answers at once. A command's
+options are a dataclass beside the code it serves; its summary here is its docstring.
+"""
+
+import difflib
+import os
+import sys
+from collections.abc import Callable, Sequence
+
+from handavatar import __version__
+from handavatar.cli import avatar, capture, default, prior, rig
+from handavatar.cli.failures import USAGE, report_failure
+
+Command = Callable[[list[str]], int]
+
+COMMANDS: dict[str, Command] = {
+    "demo": default.demo,
+    "doctor": default.doctor,
+    "capture video": capture.video,
+    "capture synth": capture.synth,
+    "capture check": capture.check,
+    "rig info": rig.info,
+    "prior train": prior.train,
+    "prior evaluate": prior.evaluate,
+    "train": avatar.train,
+    "evaluate": avatar.evaluate,
+    "render": avatar.render,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command and returns the exit code.
+
+    Args:
+        arguments: words after the program's name; those of the process by default.
+    """
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    # Before torch starts its threads: waiting threads that spin make busy machines crawl.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # Read when CUDA starts; without it matrix products on a GPU are not repeatable.
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    is_debugging = "--debug" in words
+    words = [word for word in words if word != "--debug"]
+    if words[:1] == ["--version"]:
+        print(f"handavatar {__version__}")
+        return 0
+    if not words or words[0] in ("-h", "--help", "help"):
+        print(overview())
+        return 0
+    name = next((" ".join(words[:n]) for n in (2, 1) if " ".join(words[:n]) in COMMANDS), None)
+    if name is None:
+        return _no_such_command(words)
+    try:
+        return COMMANDS[name](words[len(name.split()) :])
+    except SystemExit as request:
+        return request.code if isinstance(request.code, int) else USAGE
+    except BaseException as error:
+        return report_failure(error, is_debugging)
+
+
+def overview(group: str = "") -> str:
+    """The list of commands, or of those of one group such as ``capture``."""
+    chosen = {name: c for name, c in COMMANDS.items() if not group or name.split()[0] == group}
+    width = max(len(name) for name in chosen)
+    lines = [f"  {name:<{width}}  {_summary(command)}" for name, command in chosen.items()]
+    title = "A personal, posable, editable avatar of a hand from an ordinary video."
+    return "\n".join(
+        [
+            f"usage: handavatar {group or 'COMMAND'} ... [--debug]",
+            "",
+            *([] if group else [title, ""]),
+            *lines,
+            "",
+            "handavatar COMMAND --help shows a command's options; --version the version.",
+            "--debug adds the traceback to an error.",
+        ]
+    )
+
+
+def _summary(command: Command) -> str:
+    return (command.__doc__ or "").splitlines()[0].rstrip(".")
+
+
+def _no_such_command(words: list[str]) -> int:
+    groups = {name.split()[0] for name in COMMANDS if " " in name}
+    if words[0] in groups:
+        rest = words[1:]
+        if not rest or rest[0] in ("-h", "--help"):
+            print(overview(words[0]), file=sys.stdout if rest else sys.stderr)
+            return 0 if rest else USAGE
+    wanted = " ".join(words[:2] if words[0] in groups else words[:1])
+    near = difflib.get_close_matches(wanted, COMMANDS, n=1)
+    hint = f"did you mean 'handavatar {near[0]}'?" if near else "handavatar --help lists them all"
+    print(f"handavatar: there is no command '{wanted}'\n{hint}", file=sys.stderr)
+    return USAGE

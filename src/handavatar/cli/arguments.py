@@ -1,0 +1,138 @@
+"""From words to an options dataclass, by tyro; and from results to standard output."""
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_args, get_origin
+
+import tyro
+from tyro.constructors import PrimitiveConstructorSpec
+
+Options = TypeVar("Options")
+
+
+@dataclasses.dataclass(frozen=True)
+class Extra:
+    """An option of the command itself, not of the code it calls.
+
+    Attributes:
+        name: without the dashes.
+        kind: its type.
+        help: one line.
+        default: value if it is not given; ``...`` means that it is required.
+        is_positional: stands without a name, before the others.
+    """
+
+    name: str
+    kind: Any
+    help: str
+    default: Any = ...
+    is_positional: bool = False
+
+
+JSON = Extra("json", bool, "print one JSON object and nothing else", False)
+OUT = Extra("out", Path, "folder to write; must not exist, or be empty")
+OVERWRITE = Extra("overwrite", bool, "replace what lies there", False)
+
+
+def parse(
+    options: type[Options], words: list[str], command: str, positional: tuple[str, ...] = ()
+) -> Options:
+    """Reads the options of a command; ``--help`` and mistakes end the program.
+
+    Args:
+        options: a dataclass; its documentation is the help.
+        words: after the command's name.
+        command: for the usage line.
+        positional: fields that stand without a name, in this order.
+    """
+    return parse_with(options, (), words, command, positional)[0]
+
+
+def parse_with(
+    options: type[Options],
+    extras: tuple[Extra, ...],
+    words: list[str],
+    command: str,
+    positional: tuple[str, ...] = (),
+) -> tuple[Options, dict[str, Any]]:
+    """As :func:`parse`, with the values of further options by name.
+
+    Tyro reads a subclass of the dataclass that carries the command line's own conventions, so
+    that the code it serves need not know them.
+    """
+    fields: list[tuple[str, Any, Any]] = []
+    for extra in extras:
+        named: Any = Annotated[extra.kind, tyro.conf.arg(help=extra.help)]
+        default = dataclasses.MISSING if extra.default is ... else extra.default
+        kind = _positional(named, extra.name) if extra.is_positional else named
+        fields.append((extra.name, kind, dataclasses.field(default=default)))
+    own = dataclasses.fields(options)  # type: ignore[arg-type]
+    for field in own:
+        named = _comma_separated(field.type)
+        kind = _positional(named, field.name) if field.name in positional else named
+        # Either of the two is MISSING, which stands for none.
+        defaults: Any = {"default": field.default, "default_factory": field.default_factory}
+        fields.append((field.name, kind, dataclasses.field(**defaults)))
+    twin = dataclasses.make_dataclass(
+        options.__name__, fields, bases=(options,), kw_only=True, frozen=True
+    )
+    twin.__doc__ = options.__doc__
+    parsed: Any = tyro.cli(
+        twin, args=words, prog=f"handavatar {command}", config=(tyro.conf.FlagCreatePairsOff,)
+    )
+    return (
+        options(**{field.name: getattr(parsed, field.name) for field in own}),
+        {extra.name: getattr(parsed, extra.name) for extra in extras},
+    )
+
+
+def _positional(kind: Any, name: str) -> Any:
+    return Annotated[kind, tyro.conf.Positional, tyro.conf.arg(metavar=name.upper())]
+
+
+def _comma_separated(kind: Any) -> Any:
+    """Tuples of simple values are written ``a,b,c``."""
+    members = get_args(kind)
+    if get_origin(kind) is not tuple or members[0] not in (str, int, float):
+        return kind
+    count = None if members[-1] is Ellipsis else len(members)
+
+    def from_words(words: list[str]) -> tuple[Any, ...]:
+        values = tuple(members[0](part) for part in words[0].split(",") if part.strip())
+        if count is not None and len(values) != count:
+            raise ValueError(f"expected {count} values separated by commas, found {len(values)}")
+        return values
+
+    letters = "ABCDEFGH"
+    return Annotated[
+        kind,
+        PrimitiveConstructorSpec(
+            nargs=1,
+            metavar=",".join(letters[:count]) if count else "A,B,...",
+            instance_from_str=from_words,
+            is_instance=lambda value: isinstance(value, tuple),
+            str_from_instance=lambda value: [",".join(str(part) for part in value)],
+        ),
+    ]
+
+
+def print_json(value: dict[str, Any]) -> None:
+    """One JSON object on standard output."""
+    json.dump(value, sys.stdout, indent=2, allow_nan=False)
+    sys.stdout.write("\n")
+
+
+def print_figures(value: dict[str, Any], indent: int = 0) -> None:
+    """Nested results as indented lines for a person."""
+    width = max((len(str(name)) for name in value), default=0)
+    for name, figure in value.items():
+        label = " " * indent + f"{name:<{width}}"
+        if isinstance(figure, dict):
+            print(label.rstrip())
+            print_figures(figure, indent + 2)
+        elif isinstance(figure, float):
+            print(f"{label}  {figure:.4g}")
+        else:
+            print(f"{label}  {'-' if figure is None else figure}")

@@ -1,0 +1,31 @@
+"""``handavatar train``, ``evaluate`` and ``render``: from a capture to pictures of new poses."""
+
+
+def train(words: list[str]) -> int:
+    """Capture -> avatar."""
+    from handavatar.cli.arguments import parse
+    from handavatar.train.loop import TrainOptions
+    from handavatar.train.loop import train as train_avatar
+
+    run = train_avatar(parse(TrainOptions, words, "train", positional=("capture",)))
+    print(f"run: {run}\nnext: handavatar evaluate {run}")
+    return 0
+
+
+def evaluate(words: list[str]) -> int:
+    """PSNR, SSIM, LPIPS, mask IoU and what the truth allows, on held-out frames."""
+    from handavatar.cli.arguments import JSON, parse_with, print_figures, print_json
+    from handavatar.evaluate.run import EvaluateOptions, evaluate_run
+
+    options, extras = parse_with(EvaluateOptions, (JSON,), words, "evaluate", ("run",))
+    (print_json if extras["json"] else print_figures)(evaluate_run(options))
+    return 0
+
+
+def render(words: list[str]) -> int:
+    """Pictures and video of any pose from any camera."""
+    from handavatar.animate import RenderOptions, render_motion
+    from handavatar.cli.arguments import parse
+
+    print(render_motion(parse(RenderOptions, words, "render", positional=("run",))))
+    return 0

@@ -1,0 +1,59 @@
+"""``handavatar capture``: make captures and check them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from handavatar.cli.failures import BAD_DATA
+
+
+def video(words: list[str]) -> int:
+    """A video of one bare hand -> capture: track, mask, fit pose and shape."""
+    from handavatar.capture.video import VideoOptions, capture_video
+    from handavatar.cli.arguments import parse
+
+    options = parse(VideoOptions, words, "capture video", positional=("file",))
+    capture_video(options)
+    print(f"capture: {options.out}\nnext: handavatar train {options.out}")
+    return 0
+
+
+def synth(words: list[str]) -> int:
+    """A made capture with known albedo, light, shape and pose."""
+    from handavatar.capture.synthetic import SynthOptions, make_capture
+    from handavatar.cli.arguments import OUT, OVERWRITE, parse_with
+    from handavatar.train.progress import Progress
+
+    options, extras = parse_with(SynthOptions, (OUT, OVERWRITE), words, "capture synth")
+    with Progress("capture synth", options.train_frames + options.test_frames) as progress:
+        make_capture(
+            extras["out"], options, extras["overwrite"], lambda done, total: progress.update(done)
+        )
+    print(f"capture: {extras['out']}\nnext: handavatar train {extras['out']}")
+    return 0
+
+
+@dataclass(frozen=True)
+class _CheckOptions:
+    """Reads a capture completely and names every problem with file, frame and remedy.
+
+    Attributes:
+        capture: folder of the capture.
+    """
+
+    capture: Path
+
+
+def check(words: list[str]) -> int:
+    """Validate a capture: every problem with file, frame and remedy."""
+    from handavatar.capture.frames import find_problems
+    from handavatar.cli.arguments import JSON, parse_with, print_json
+
+    options, extras = parse_with(_CheckOptions, (JSON,), words, "capture check", ("capture",))
+    problems = find_problems(options.capture)
+    if extras["json"]:
+        print_json({"sound": not problems, "problems": [vars(problem) for problem in problems]})
+    else:
+        for problem in problems:
+            print(problem)
+        print(f"{options.capture}: {f'{len(problems)} problems' if problems else 'sound'}")
+    return BAD_DATA if problems else 0

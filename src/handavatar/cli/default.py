@@ -1,0 +1,40 @@
+"""``handavatar demo`` and ``handavatar doctor``: what needs nothing of the user's."""
+
+from dataclasses import dataclass
+
+from handavatar.cli.failures import BAD_DATA
+
+
+def demo(words: list[str]) -> int:
+    """The whole road on the capture that ships: train, evaluate, render, report."""
+    from handavatar.cli.arguments import parse
+    from handavatar.demo import DemoOptions, run_demo
+
+    run_demo(parse(DemoOptions, words, "demo"))
+    return 0
+
+
+@dataclass(frozen=True)
+class _DoctorOptions:
+    """Looks at this machine and this installation: what is missing, and the remedy."""
+
+
+def doctor(words: list[str]) -> int:
+    """What is missing on this machine, and the command that mends it."""
+    from handavatar.cli.arguments import JSON, parse_with, print_json
+    from handavatar.doctor import examine
+
+    _, extras = parse_with(_DoctorOptions, (JSON,), words, "doctor")
+    findings = examine()
+    is_able = all(finding.state != "missing" for finding in findings)
+    if extras["json"]:
+        print_json({"able": is_able, "findings": [vars(finding) for finding in findings]})
+    else:
+        for finding in findings:
+            print(finding)
+        print(
+            "\nEverything that handavatar demo, train, evaluate and render need is here."
+            if is_able
+            else "\nSomething is missing that handavatar cannot work without; see above."
+        )
+    return 0 if is_able else BAD_DATA

@@ -1,0 +1,24 @@
+"""``handavatar prior``: the occupancy field before it has seen a person."""
+
+
+def train(words: list[str]) -> int:
+    """Pre-train the occupancy prior on sampled poses and shapes."""
+    from handavatar.cli.arguments import parse
+    from handavatar.train.prior import PriorOptions, train_prior
+    from handavatar.train.progress import Progress
+
+    options = parse(PriorOptions, words, "prior train")
+    with Progress("prior", options.steps) as progress:
+        train_prior(options, lambda step, figures: progress.update(step, **figures))
+    print(f"prior: {options.out}\nnext: handavatar prior evaluate --prior {options.out}")
+    return 0
+
+
+def evaluate(words: list[str]) -> int:
+    """How well a prior knows inside from outside, on unseen poses and shapes."""
+    from handavatar.cli.arguments import JSON, parse_with, print_figures, print_json
+    from handavatar.train.prior import PriorEvaluationOptions, evaluate_prior
+
+    options, extras = parse_with(PriorEvaluationOptions, (JSON,), words, "prior evaluate")
+    (print_json if extras["json"] else print_figures)(evaluate_prior(options))
+    return 0

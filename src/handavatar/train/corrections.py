@@ -1,0 +1,33 @@
+"""Per-frame corrections of tracked poses, learned with the avatar."""
+
+import torch
+from torch import Tensor, nn
+
+from handavatar.hand.pose import NUM_BONES, HandPose
+
+
+class PoseCorrections(nn.Module):
+    """Small changes of rotations (radians) and translation (metres) for each training frame.
+
+    Departs: the authors never correct a pose, and the geometry wrinkles to compensate
+        (paper, limitations).
+    """
+
+    def __init__(self, num_frames: int) -> None:
+        """Starts at no correction."""
+        super().__init__()
+        self.rotations = nn.Parameter(torch.zeros(num_frames, NUM_BONES, 3))
+        self.translations = nn.Parameter(torch.zeros(num_frames, 3))
+
+    def forward(self, frame: int, pose: HandPose) -> HandPose:
+        """The corrected pose of a frame, by its number among the training frames."""
+        return HandPose(
+            pose.rotations + self.rotations[frame], pose.translation + self.translations[frame]
+        )
+
+    def penalty(self, frame: int) -> Tensor:
+        """Grows with the correction: 1 at about 6 degrees or 5 mm in one component."""
+        return (
+            100 * self.rotations[frame].square().sum()
+            + 4e4 * self.translations[frame].square().sum()
+        )

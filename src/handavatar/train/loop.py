@@ -1,0 +1,474 @@
+"""The training loop: capture in, avatar out. There is only this one."""
+
+import math
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from handavatar.avatar import HandAvatar, RenderSettings
+from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
+from handavatar.evaluate.perceptual import PerceptualLoss, perceptual_loss
+from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
+from handavatar.geometry.meshes import is_inside, unique_edges
+from handavatar.hand.open_hand import load_open_hand
+from handavatar.hand.rig import RigError
+from handavatar.render.silhouette import silhouette_loss, soft_silhouette
+from handavatar.train.corrections import PoseCorrections
+from handavatar.train.losses import color_loss, occupancy_loss, offset_loss
+from handavatar.train.optimizer_state import (
+    optimizer_options,
+    optimizer_tensors,
+    restore_optimizer,
+)
+from handavatar.train.prior import SHIPPED_PRIOR, load_prior, sample_points
+from handavatar.train.progress import Progress
+from handavatar.train.runs import (
+    Run,
+    append_log,
+    create_run,
+    default_run_folder,
+    latest_checkpoint,
+    latest_run_folder,
+    load_checkpoint,
+    locked,
+    open_run,
+    save_checkpoint,
+    truncate_log,
+)
+
+
+@dataclass(frozen=True)
+class Method:
+    """The budget of a training; the method itself is always the whole one.
+
+    Attributes:
+        steps: optimisation steps.
+        frames: frames per step.
+        patches: patches per frame.
+        patch_size: pixels along a side.
+        num_samples: samples per ray while training.
+        silhouette_size: the mask is compared at this many pixels along a side.
+        lr: learning rate of shape, albedo and illumination at the start.
+        lr_codes: learning rate of the albedo codes at the start.
+        lr_decoder: learning rate of the pair decoder at the start.
+        lr_pose: learning rate of the pose corrections at the start.
+        decay: all learning rates fall by this factor until the end, exponentially.
+        occupancy_points: labelled points per frame for L_PairOF.
+        occupancy_every: L_PairOF is taken at every so many steps.
+    """
+
+    steps: int
+    frames: int
+    patches: int
+    patch_size: int
+    num_samples: int
+    silhouette_size: int
+    lr: float = 5e-4
+    lr_codes: float = 5e-4
+    lr_decoder: float = 5e-5
+    lr_pose: float = 1e-3
+    decay: float = 0.1
+    occupancy_points: int = 1024
+    occupancy_every: int = 1
+
+
+METHODS: dict[str, Method] = {
+    "quick": Method(
+        steps=500,
+        frames=1,
+        patches=1,
+        patch_size=32,
+        num_samples=32,
+        silhouette_size=128,
+        lr=2e-3,
+        lr_codes=1e-2,
+        occupancy_every=4,
+    ),
+    "paper": Method(
+        steps=50_000,
+        frames=8,
+        patches=2,
+        patch_size=32,
+        num_samples=64,
+        silhouette_size=256,
+    ),
+}
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    """What to train and where to.
+
+    Attributes:
+        capture: folder of the capture.
+        out: run folder; by default ``outputs/{capture}/{method}/{time}``.
+        method: the budget: ``quick`` for two CPU cores and minutes, ``paper`` for the paper's.
+        steps: overrides the method's number of steps.
+        resume: ``auto`` continues the newest run of this capture and method (or the one at
+            ``out``) if there is one; ``never`` starts anew.
+        prior: occupancy prior to start from.
+        perceptual: ``auto`` takes LPIPS where its weights are present, else the substitute; the
+            run records which.
+        checkpoint_every: steps between checkpoints.
+        seed: of everything.
+        device: ``auto`` takes a GPU if there is one.
+    """
+
+    capture: Path
+    out: Path | None = None
+    method: Literal["quick", "paper"] = "quick"
+    steps: int | None = None
+    resume: Literal["auto", "never"] = "auto"
+    prior: Path = SHIPPED_PRIOR
+    perceptual: Literal["auto", "lpips", "substitute"] = "auto"
+    checkpoint_every: int = 100
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """Everything that changes while training.
+
+    Attributes:
+        avatar: what is trained.
+        corrections: of the tracked poses; None where poses are known exactly.
+        optimizer: over both.
+    """
+
+    avatar: HandAvatar
+    corrections: PoseCorrections | None
+    optimizer: torch.optim.Optimizer
+
+
+class Interrupted(KeyboardInterrupt):
+    """Training was told to stop and has saved a checkpoint."""
+
+
+def train(options: TrainOptions) -> Path:
+    """Trains an avatar and returns the run folder.
+
+    Raises:
+        CaptureError: if the capture is damaged or has no training frames.
+        RigError: if the capture's poses belong to another rig.
+        CheckpointError: if the run to resume is damaged.
+        FloatingPointError: if the loss is no longer finite; the last checkpoint stays.
+        Interrupted: after SIGINT or SIGTERM; a checkpoint was saved.
+
+    Source: paper Sec. 4.1 (end-to-end training).
+    """
+    device = chosen_device(options.device)
+    method = METHODS[options.method]
+    steps = options.steps or method.steps
+    capture = read_capture(options.capture)
+    indices = capture.split("train")
+    if not indices:
+        raise CaptureError(
+            f"{capture.folder}: no frame of split 'train'", "mark some frames as split: train"
+        )
+    frames = [capture.frame(index) for index in indices]
+    perceptual = perceptual_loss(options.perceptual).to(device)
+    training = begin_training(capture, len(frames), method, options)
+    training.avatar.moved_to(device)
+    run = _open_or_create(options, capture, perceptual.name, steps)
+    with locked(run), _stop_signals() as stopped:
+        start = _restore(run, training)
+        edges = unique_edges(training.avatar.rig.faces)
+        with Progress("train", steps, start) as progress:
+            for step in range(start + 1, steps + 1):
+                _set_learning_rates(training.optimizer, method.decay ** ((step - 1) / steps))
+                figures = train_step(
+                    training, frames, edges, perceptual, method, step, options.seed
+                )
+                if not all(math.isfinite(value) for value in figures.values()):
+                    raise FloatingPointError(
+                        f"step {step}: the loss is not finite ({figures}); the last checkpoint in "
+                        f"{run.checkpoints} is good: resume from it with another --seed"
+                    )
+                append_log(run, step, figures)
+                progress.update(step, psnr=figures["psnr"], loss=figures["loss"])
+                is_last = step == steps
+                if is_last or stopped() or step % options.checkpoint_every == 0:
+                    _save(run, training, step)
+                if stopped() and not is_last:
+                    raise Interrupted(f"stopped at step {step}; continue with --resume auto")
+    training.avatar.save(run.avatar)
+    return run.folder
+
+
+def chosen_device(name: str) -> torch.device:
+    """``auto`` is CUDA where there is one.
+
+    Raises:
+        ValueError: if ``cuda`` is asked for and there is none.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: no CUDA device is visible to torch; use --device cpu")
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(name)
+
+
+def begin_training(
+    capture: Capture, num_frames: int, method: Method, options: TrainOptions
+) -> Training:
+    """An untrained avatar of the capture's person with the prior's geometry, and its optimiser."""
+    rig = load_open_hand()
+    if capture.rig_sha256 != rig.sha256:
+        raise RigError(
+            f"{capture.folder}: its poses belong to rig {capture.rig_name} "
+            f"({capture.rig_sha256[:12]}), this is {rig.name} ({rig.sha256[:12]}): make the "
+            "capture again with this version"
+        )
+    torch.manual_seed(options.seed)
+    info = {
+        "side": capture.side,
+        "subject": capture.subject,
+        "method": options.method,
+        "color_space": capture.color_space,
+        "licence": capture.licence,
+    }
+    avatar = HandAvatar(rig, capture.shape_coefficients, info=info)
+    load_prior(avatar.occupancy, options.prior)
+    avatar.occupancy.encoder.requires_grad_(False)
+    is_tracked = capture.source.startswith("video")
+    corrections = PoseCorrections(num_frames) if is_tracked else None
+    device = chosen_device(options.device)
+    avatar.moved_to(device)
+    groups: list[dict[str, Any]] = [
+        {
+            "params": [
+                *avatar.shape.parameters(),
+                *avatar.albedo.mlp.parameters(),
+                *avatar.illumination.parameters(),
+            ],
+            "lr": method.lr,
+        },
+        {"params": [avatar.albedo.codes], "lr": method.lr_codes},
+        {"params": list(avatar.occupancy.decoder.parameters()), "lr": method.lr_decoder},
+    ]
+    if corrections is not None:
+        corrections.to(device)
+        groups.append({"params": list(corrections.parameters()), "lr": method.lr_pose})
+    for group in groups:
+        group["initial_lr"] = group["lr"]
+    return Training(avatar, corrections, torch.optim.Adam(groups))
+
+
+def train_step(
+    training: Training,
+    frames: list[Frame],
+    edges: Int[Tensor, "edges 2"],
+    perceptual: PerceptualLoss,
+    method: Method,
+    step: int,
+    seed: int,
+) -> dict[str, float]:
+    """One optimiser step over the step's own frames, patches and random numbers.
+
+    All randomness comes from ``(seed, step)``, so that a resumed training repeats nothing and
+    skips nothing.
+
+    Returns:
+        The losses' values and the PSNR over the patches.
+    """
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
+    training.optimizer.zero_grad(set_to_none=True)
+    sums: dict[str, float] = {}
+    for place in range(method.frames):
+        number = _frame_number(len(frames), (step - 1) * method.frames + place, seed)
+        losses = frame_losses(
+            training, frames[number], number, edges, perceptual, method, step, generator
+        )
+        squared = losses.pop("squared_error")
+        total = torch.stack(list(losses.values())).sum() / method.frames
+        total.backward()
+        for name, value in {**losses, "loss": total * method.frames, "squared": squared}.items():
+            sums[name] = sums.get(name, 0.0) + float(value.detach()) / method.frames
+    training.optimizer.step()
+    sums["psnr"] = -10 * math.log10(max(sums.pop("squared"), 1e-10))
+    return sums
+
+
+def frame_losses(
+    training: Training,
+    frame: Frame,
+    number: int,
+    edges: Int[Tensor, "edges 2"],
+    perceptual: PerceptualLoss,
+    method: Method,
+    step: int,
+    generator: torch.Generator,
+) -> dict[str, Tensor]:
+    """All losses of one frame; ``squared_error`` beside them for the record."""
+    avatar = training.avatar
+    device = avatar.device
+    pose = frame.pose.to(device)
+    losses: dict[str, Tensor] = {}
+    if training.corrections is not None:
+        pose = training.corrections(number, pose)
+        losses["pose"] = 0.01 * training.corrections.penalty(number)
+    state = avatar.prepare(pose)
+
+    camera = frame.camera.to(device)
+    small = camera.resized(method.silhouette_size, method.silhouette_size)
+    mask = _resized_mask(frame.mask, method.silhouette_size).to(device)
+    coverage = soft_silhouette(state.posed.vertices, avatar.rig.faces, small)
+    losses["silhouette"] = silhouette_loss(coverage, mask)
+    losses["offsets"] = 0.1 * offset_loss(state.offsets, edges)
+
+    if step % method.occupancy_every == 0:
+        points = sample_points(
+            avatar.parts, state.posed, method.occupancy_points, avatar.occupancy.margin, generator
+        ).detach()
+        labels = is_inside(state.posed.sealed_vertices, avatar.rig.sealed_faces, points)
+        items = avatar.occupancy(state.codes, points).items
+        predicted = avatar.occupancy.of_items(state.codes, points, items)
+        losses["occupancy"] = occupancy_loss(predicted, labels)
+
+    settings = RenderSettings(num_samples=method.num_samples, smallest_weight=1e-6, stop=1e-5)
+    pixels = torch.cat(
+        [patch_pixels(frame.mask, method.patch_size, generator) for _ in range(method.patches)]
+    )
+    x, y = pixels.unbind(-1)
+    centers = pixel_centers(camera)[y, x]
+    seen = avatar.render_rays(state, rays_through_pixels(camera, centers), settings, generator)
+    background = torch.rand(3, generator=generator).to(device)
+    truth = frame.image[y, x].to(device).float() / 255
+    is_hand = frame.mask[y, x].to(device)
+    truth = torch.where(is_hand[:, None], truth, background)
+    color = seen.color + (1 - seen.alpha[:, None]) * background
+    losses["color"] = color_loss(color, truth)
+    size = (method.patches, method.patch_size, method.patch_size)
+    losses["perceptual"] = perceptual(color.unflatten(0, size), truth.unflatten(0, size)).mean()
+    losses["squared_error"] = (color.detach() - truth).square().mean()
+    return losses
+
+
+def patch_pixels(mask: Tensor, size: int, generator: torch.Generator) -> Int[Tensor, "pixels 2"]:
+    """Pixels (x, y) of a square patch that lies on the hand.
+
+    The centre is a pixel of the mask four times out of five, else one of the square around it.
+
+    Raises:
+        CaptureError: if the picture is smaller than the patch.
+    """
+    height, width = mask.shape
+    if min(height, width) < size:
+        raise CaptureError(
+            f"pictures of {width} x {height} pixels are smaller than a {size} x {size} patch",
+            "make the capture with larger pictures",
+        )
+    on_hand = mask.nonzero()
+    if len(on_hand) == 0:
+        center = torch.tensor([height // 2, width // 2])
+    elif float(torch.rand((), generator=generator)) < 0.8:
+        center = on_hand[torch.randint(len(on_hand), (), generator=generator)]
+    else:
+        lower, upper = on_hand.amin(0), on_hand.amax(0) + 1
+        center = lower + (torch.rand(2, generator=generator) * (upper - lower)).long()
+    top = int(center[0].clamp(size // 2, height - size + size // 2)) - size // 2
+    left = int(center[1].clamp(size // 2, width - size + size // 2)) - size // 2
+    y, x = torch.meshgrid(
+        torch.arange(top, top + size), torch.arange(left, left + size), indexing="ij"
+    )
+    return torch.stack([x, y], dim=-1).flatten(0, 1)
+
+
+def _resized_mask(mask: Tensor, size: int) -> Tensor:
+    """True where more than half of a small pixel is hand."""
+    shares = torch.nn.functional.interpolate(mask[None, None].float(), (size, size), mode="area")
+    return shares[0, 0] > 0.5
+
+
+def _frame_number(num_frames: int, visit: int, seed: int) -> int:
+    """Frames in a new random order every epoch."""
+    epoch, place = divmod(visit, num_frames)
+    generator = torch.Generator().manual_seed(seed * 7919 + epoch)
+    return int(torch.randperm(num_frames, generator=generator)[place])
+
+
+def _set_learning_rates(optimizer: torch.optim.Optimizer, factor: float) -> None:
+    for group in optimizer.param_groups:
+        group["lr"] = group["initial_lr"] * factor
+
+
+def _open_or_create(options: TrainOptions, capture: Capture, perceptual: str, steps: int) -> Run:
+    folder = options.out
+    if folder is None and options.resume == "auto":
+        folder = latest_run_folder(options.capture, options.method)
+        if folder is not None and (folder / "avatar.safetensors").exists():
+            folder = None
+    if folder is not None and options.resume == "auto" and (folder / "run.json").exists():
+        return open_run(folder)
+    folder = folder or default_run_folder(options.capture, options.method)
+    record = {
+        name: str(value) if isinstance(value, Path) else value
+        for name, value in asdict(options).items()
+    }
+    record |= {"steps": steps, "budget": asdict(METHODS[options.method])}
+    return create_run(
+        folder,
+        record,
+        seed=options.seed,
+        capture=options.capture,
+        capture_sha256=capture.sha256,
+        perceptual=perceptual,
+    )
+
+
+def _save(run: Run, training: Training, step: int) -> None:
+    model = {f"avatar.{name}": value for name, value in training.avatar.state_dict().items()}
+    if training.corrections is not None:
+        state = training.corrections.state_dict()
+        model |= {f"corrections.{name}": value for name, value in state.items()}
+    tensors = {"model": model, "optimizer": optimizer_tensors(training.optimizer)}
+    save_checkpoint(run, step, tensors, optimizer_options(training.optimizer))
+
+
+def _restore(run: Run, training: Training) -> int:
+    """Loads the newest whole checkpoint, if any; returns its step."""
+    checkpoint = latest_checkpoint(run)
+    if checkpoint is None:
+        truncate_log(run, 0)
+        return 0
+    contents = load_checkpoint(checkpoint)
+    model = contents.tensors["model"]
+    training.avatar.load_state_dict(_named(model, "avatar."))
+    if training.corrections is not None:
+        training.corrections.load_state_dict(_named(model, "corrections."))
+    restore_optimizer(training.optimizer, contents.tensors["optimizer"], contents.state)
+    truncate_log(run, checkpoint.step)
+    return checkpoint.step
+
+
+def _named(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    return {name[len(prefix) :]: v for name, v in tensors.items() if name.startswith(prefix)}
+
+
+@contextmanager
+def _stop_signals() -> Iterator[Any]:
+    """Turns the first SIGINT or SIGTERM into a wish to stop; the second one kills."""
+    received: list[int] = []
+
+    def note(number: int, _: Any) -> None:
+        received.append(number)
+        signal.signal(number, before[number])
+
+    try:
+        before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+    except ValueError:  # Not in the main thread: signals are the caller's business.
+        yield lambda: False
+        return
+    try:
+        yield lambda: bool(received)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
