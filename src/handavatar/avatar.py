@@ -26,7 +26,7 @@ from handavatar.geometry.meshes import SurfacePoints, vertex_normals
 from handavatar.hand.detail import subdivided
 from handavatar.hand.parts import Parts, divide_into_parts
 from handavatar.hand.pose import HandPose
-from handavatar.hand.rig import PosedHand, Rig
+from handavatar.hand.rig import PosedHand, Rig, ShapedHand
 from handavatar.render.sampling import depths_along, intervals_through_boxes
 from handavatar.render.volume import composite_sparse, visibility
 
@@ -175,10 +175,10 @@ class HandAvatar(nn.Module):
         self.parts = self.parts.to(device)
         return self
 
-    def pose_hand(self, pose: HandPose) -> PosedHand:
-        """The personal mesh in a pose (paper Sec. 3.1)."""
+    def personal(self, pose: HandPose) -> ShapedHand:
+        """The personal rest hand of a pose (paper Sec. 3.1)."""
         rest = self.rig.shaped(self.coefficients)
-        return personal_hand(rest, self.shape(rest, pose.rotations)).posed(pose)
+        return personal_hand(rest, self.shape(rest, pose.rotations))
 
     def prepare(self, pose: HandPose) -> HandState:
         """Does once what all rays of a pose share."""

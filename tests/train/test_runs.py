@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from handavatar.avatar import CheckpointError
 from handavatar.train import runs
 from handavatar.train.optimizer_state import (
     optimizer_options,
@@ -21,7 +22,6 @@ from handavatar.train.optimizer_state import (
 )
 from handavatar.train.provenance import folder_sha256
 from handavatar.train.runs import (
-    CheckpointError,
     Run,
     append_log,
     create_run,

@@ -91,7 +91,7 @@ def _decoded(
 ) -> Iterator[VideoFrame]:
     stream = container.streams.video[0]
     width, height = stream.codec_context.width, stream.codec_context.height
-    if not (_MIN_SIDE <= min(width, height) and width * height <= _MAX_PIXELS):
+    if not (min(width, height) >= _MIN_SIDE and width * height <= _MAX_PIXELS):
         raise CaptureError(
             f"{path}: pictures of {width} x {height} pixels; expected at least {_MIN_SIDE} on the "
             f"short side and at most {_MAX_PIXELS // 1_000_000} megapixels",
@@ -140,7 +140,7 @@ def _expected_seconds(
 
 
 def _upright(frame: av.VideoFrame) -> UInt8[np.ndarray, "height width 3"]:
-    """sRGB picture with the recording phone's rotation undone, at working size."""
+    """SRGB picture with the recording phone's rotation undone, at working size."""
     scale = min(1.0, _MAX_WORKING_SIDE / max(frame.width, frame.height))
     if scale < 1:
         even = [2 * round(side * scale / 2) for side in (frame.width, frame.height)]

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
@@ -18,7 +18,6 @@ from handavatar.hand.pose_sampling import (
     angles_from_rotations,
     gesture_rotations,
     limit_excess,
-    rotations_from_angles,
 )
 from handavatar.hand.rig import Rig
 

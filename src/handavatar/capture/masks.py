@@ -30,6 +30,7 @@ _BACKGROUND_MARGIN = 0.042
 _FOREARM_HALF_ANGLE = 60.0
 _HOLE_RADIUS = 0.004
 _CUT_ROUNDS = 2
+_SURE = 4.0
 
 _LMS_FROM_RGB = np.array(
     [
@@ -229,7 +230,10 @@ def find_mask(hand: TrackedHand, colors: ColorModel) -> HandMask:
     labels = np.full(ratio.shape, _BACKGROUND, dtype=np.uint8)
     labels[allowed] = _LIKELY_BACKGROUND
     labels[by_color] = _LIKELY_HAND
-    labels[regions.core & (ratio > 2)] = _HAND
+    # Left to itself GrabCut fills the gaps between fingers; where colour is sure, it decides.
+    labels[ratio < -_SURE] = _BACKGROUND
+    labels[(ratio > _SURE) & allowed] = _HAND
+    labels[regions.core & (ratio > 0)] = _HAND
     cut = _graph_cut(hand.window.image, labels)
     cleaned = _cleaned(cut, regions)
     reference = _cleaned(by_color, regions)

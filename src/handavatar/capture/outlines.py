@@ -91,9 +91,7 @@ class OutlineMatcher:
         self._rim = rig.rim.numpy()
         self._generator = np.random.default_rng(0)
 
-    def __call__(
-        self, vertices: Float[Tensor, "frames vertices 3"], focal: float
-    ) -> OutlinePairs:
+    def __call__(self, vertices: Float[Tensor, "frames vertices 3"], focal: float) -> OutlinePairs:
         """Pairs for vertices in camera axes (metres) and a focal length (pixels)."""
         normals = vertex_normals(vertices, self._rig.faces)
         facing = (normals * torch.nn.functional.normalize(vertices, dim=-1)).sum(-1)
@@ -188,7 +186,11 @@ class wrist_line:
 
 
 def window_camera(
-    focal: float, picture_size: tuple[int, int], corner: tuple[float, float], side: float, pixels: int
+    focal: float,
+    picture_size: tuple[int, int],
+    corner: tuple[float, float],
+    side: float,
+    pixels: int,
 ) -> Camera:
     """The camera of a square piece of the picture, resized.
 

@@ -33,13 +33,13 @@ class Lights:
     at the scene's centre. Directions point from the centre to the light, in the world.
     """
 
-    key: float = 0.72
-    key_direction: tuple[float, float, float] = (-0.52, -0.60, -0.61)
+    key: float = 0.78
+    key_direction: tuple[float, float, float] = (-0.50, -0.58, -0.64)
     key_size: float = 0.24
     """side of the square, metres; larger is softer"""
-    fill: float = 0.09
+    fill: float = 0.07
     fill_direction: tuple[float, float, float] = (0.1, -0.6, 0.8)
-    ambient: float = 0.13
+    ambient: float = 0.10
     distance: float = 0.9
     """of both lights from the centre, metres"""
 

@@ -43,7 +43,7 @@ class SkinOptions:
 
     seed: int = 0
     """another seed, another subject: line courses, veins, spots, mottling"""
-    tone: float = 0.4
+    tone: float = 0.35
     """0 very light to 1 very dark"""
     redness: float = 1.0
     """strength of the blood in knuckles, finger pads and palm"""
@@ -160,7 +160,7 @@ class _Painter:
         self.dorsal = (_unit(weights @ dorsal) * self.normals).sum(-1)
         self.is_back = _step(self.dorsal, -0.15, 0.35)
         self.bone = weights.argmax(-1)
-        self.scale = np.linalg.norm(self.joints[4]) / _PALM_REFERENCE
+        self.scale = float(np.linalg.norm(self.joints[4])) / _PALM_REFERENCE
 
     def colors(self) -> np.ndarray:
         options = self.options
@@ -170,7 +170,7 @@ class _Painter:
         color = palm * (1 - blend) + back * blend
         # Paint multiplies: pigment absorbs. Blood takes green and blue, pigment more of blue.
         blood = options.redness * self.blood() + options.mottling * (
-            0.55 * self.noise(7.0) + 0.35 * self.noise(2.6)
+            0.35 * self.noise(7.0) + 0.3 * self.noise(2.6)
         ) * (1.15 - 0.45 * self.is_back)
         pigment = options.mottling * (0.5 * self.noise(15.0) + 0.45 * self.noise(1.4))
         pigment = pigment + self.knuckle_pigment() * tone + 2.2 * self.spots()
@@ -215,7 +215,7 @@ class _Painter:
     def blood(self) -> np.ndarray:
         """Knuckles on the back; pads, tips and the balls of the thumb and little finger below."""
         front = 1 - self.is_back
-        total = 0.5 * self.noise(22.0) * front
+        total = 0.3 * self.noise(22.0) * front
         for finger, (first, second, third) in FINGER_BONES.items():
             size = 1.25 if finger == "thumb" else 1.0
             for bone, radius, weight in ((first, 6.5, 1.2), (second, 6.0, 1.5), (third, 5.0, 0.9)):
@@ -232,7 +232,9 @@ class _Painter:
             ((-42, -22, -32), 14, 1.1),
             ((-80, -18, 0), 16, 0.5),
         ):
-            total = total + weight * front * self.bump(x * np.array(center, float), x * radius)
+            total = total + weight * front * self.bump(
+                x * np.array(center, float), float(x * radius)
+            )
         return total
 
     def knuckle_pigment(self) -> np.ndarray:

@@ -97,7 +97,7 @@ class SynthOptions:
     """light paths per pixel"""
     seed: int = 7
     """subject, skin and motion"""
-    tone: float = 0.4
+    tone: float = 0.35
     """skin: 0 very light to 1 very dark"""
     personal: float = 1.0
     """strength of the displacement that shape coefficients cannot express"""
@@ -227,20 +227,20 @@ def _personal_displacement(rig: Rig, random: np.random.Generator) -> Float[Tenso
     def bump(center: np.ndarray, radius: float) -> np.ndarray:
         return np.exp(-0.5 * ((places - center) ** 2).sum(-1) / radius**2)
 
-    total = 0.75 * smooth_noise(places, np.full(3, 38.0), random)
-    total += 0.35 * smooth_noise(places, np.full(3, 15.0), random)
+    total = 1.1 * smooth_noise(places, np.full(3, 38.0), random)
+    total += 0.5 * smooth_noise(places, np.full(3, 15.0), random)
     for first, second, third in FINGER_BONES.values():
-        total += random.normal(1.2, 0.5) * back * bump(joints[first], 7)
-        total += random.normal(0.8, 0.5) * bump(joints[second], 6)
+        total += random.normal(1.6, 0.7) * back * bump(joints[first], 7)
+        total += random.normal(1.1, 0.6) * bump(joints[second], 6)
         total += random.normal(0.4, 0.3) * bump(joints[third], 5)
         middle = (joints[second] + joints[third]) / 2
         total += random.normal(-0.2, 0.4) * bump(middle, 6)
     for center, radius, mean in (
-        ((-40, -25, 34), 15, 1.8),
-        ((-42, -20, -32), 16, 1.2),
-        ((-58, -20, -4), 13, -1.5),
+        ((-40, -25, 34), 15, 2.5),
+        ((-42, -20, -32), 16, 1.8),
+        ((-58, -20, -4), 13, -2.2),
     ):
-        total += random.normal(mean, 0.6) * front * bump(np.array(center, float), radius)
+        total += random.normal(mean, 0.8) * front * bump(np.array(center, float), radius)
     # The wrist's rim stays where the rig has it.
     total *= 1 - bump(joints[0], 12)
     return torch.from_numpy(total.clip(-3.5, 3.5) / 1000).float()

@@ -54,6 +54,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _no_such_command(words)
     try:
         return COMMANDS[name](words[len(name.split()) :])
+    except BrokenPipeError:  # the reader, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except SystemExit as request:
         return request.code if isinstance(request.code, int) else USAGE
     except BaseException as error:

@@ -1,6 +1,7 @@
 """Building blocks: positional encoding, multilayer perceptron, PointNet."""
 
 import math
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float
@@ -39,7 +40,7 @@ class MLP(nn.Module):
         """Widths in units; ``depth`` hidden layers (paper appendix, table of MLPs)."""
         super().__init__()
         widths = [width_in] + [width] * depth
-        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths, widths[1:]))
+        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
         self.output = nn.Linear(width, width_out)
         for layer in self.hidden:
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")

@@ -238,13 +238,13 @@ class PairOccupancy(nn.Module):
 
     def forward(self, codes: HandCodes, points: Float[Tensor, "points 3"]) -> Occupancy:
         """Occupancy at world points (metres), without gradient; the fast way."""
-        pieces = []
+        starts = range(0, max(len(points), 1), self.chunk)
         with torch.no_grad():
-            for start in range(0, max(len(points), 1), self.chunk):
-                pieces.append(self._chunk_occupancy(codes, points[start : start + self.chunk]))
-        offsets = range(0, max(len(points), 1), self.chunk)
+            pieces = [
+                self._chunk_occupancy(codes, points[start : start + self.chunk]) for start in starts
+            ]
         items = PairItems(
-            torch.cat([p.items.points + offset for p, offset in zip(pieces, offsets)]),
+            torch.cat([p.items.points + start for p, start in zip(pieces, starts, strict=True)]),
             torch.cat([p.items.pairs for p in pieces]),
             torch.cat([p.items.is_wanted for p in pieces]),
         )

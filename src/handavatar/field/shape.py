@@ -52,7 +52,7 @@ class ShapeOffsets(nn.Module):
         return self.mlp.output(values)
 
 
-def personal_hand(rig: Rig, rest: ShapedHand, offsets: Float[Tensor, "vertices 3"]) -> ShapedHand:
+def personal_hand(rest: ShapedHand, offsets: Float[Tensor, "vertices 3"]) -> ShapedHand:
     """The rest hand with offsets added, shifted so that the wrist joint stays.
 
     Source: paper Sec. 3.1, V~ = V + M_shape.

@@ -24,6 +24,7 @@ WINDOW = 3.0
 at most ``sigmoid(-WINDOW ** 2)`` = 1.2e-4."""
 
 _LONGEST_PIECE = 1.0
+_MOST_PIECES = 4096
 _STEP_ACROSS = 0.01
 
 
@@ -129,7 +130,7 @@ def _outline(
     height: int,
 ) -> _Pieces:
     """The pieces of contours with nothing on one side, as far as the image sees them."""
-    pieces = _split(_contour_edges(pixels, faces), pixels, width + height)
+    pieces = _split(_contour_edges(pixels, faces), pixels)
     corners = pieces.corners(pixels)
     limit = pixels.new_tensor([width, height]) + radius
     pieces = pieces.chosen(((corners.amax(1) > -radius) & (corners.amin(1) < limit)).all(-1))
@@ -164,12 +165,10 @@ def _contour_edges(
     return torch.stack([first, contour - first * len(pixels)], dim=-1)
 
 
-def _split(
-    edges: Int[Tensor, "edges 2"], pixels: Float[Tensor, "vertices 2"], most: int
-) -> _Pieces:
-    """Pieces of at most one pixel, but at most so many of one edge."""
+def _split(edges: Int[Tensor, "edges 2"], pixels: Float[Tensor, "vertices 2"]) -> _Pieces:
+    """Pieces of at most one pixel; edges of absurd length get longer ones."""
     start, end = pixels[edges].unbind(1)
-    count = ((end - start).norm(dim=-1) / _LONGEST_PIECE).ceil().clamp(1, most).long()
+    count = ((end - start).norm(dim=-1) / _LONGEST_PIECE).ceil().clamp(1, _MOST_PIECES).long()
     edge, number = numbered_copies(count)
     return _Pieces(
         edges[edge],
@@ -200,6 +199,8 @@ def _is_covered(
     lower, upper = corners.amin(1) - 0.5, corners.amax(1) + 0.5
     for face, x, y in pixels_in_boxes(lower, upper, columns, rows):
         pixel = y * columns + x
+        is_met = num_points[pixel] > 0
+        face, pixel = face[is_met], pixel[is_met]
         pair, rank = numbered_copies(num_points[pixel])
         point = by_home[first_point[pixel[pair]] + rank]
         _, holds = weights_in_image(corners[face[pair]], points[point])

@@ -3,7 +3,6 @@
 Source: paper Sec. 4.1: ``L_shape + L_PairOF + L_SelF``.
 """
 
-import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
