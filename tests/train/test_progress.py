@@ -22,7 +22,7 @@ def test_without_a_terminal_one_json_line_every_ten_seconds() -> None:
     with Progress("train", 100, stream=stream, clock=clock) as progress:
         for step in range(1, 51):
             clock.now += 0.5  # two steps a second for 25 seconds
-            progress.update(step, psnr=20 + step / 10, loss=float("nan"))
+            progress.update(step, psnr=20.0 + step / 10, loss=float("nan"))
     lines = [json.loads(line) for line in stream.getvalue().splitlines()]
     assert [line["step"] for line in lines] == [20, 40, 50]
     assert lines[0] == {
@@ -73,6 +73,6 @@ def test_on_a_terminal_one_line_with_psnr_and_time_left() -> None:
 
 
 def test_durations_read_well() -> None:
-    seconds = [0.4, 59, 60, 185, 3600, 7800, float("inf")]
+    seconds = [0.4, 59.0, 60.0, 185.0, 3600.0, 7800.0, float("inf")]
     expected = ["0 s", "59 s", "1:00 min", "3:05 min", "1:00 h", "2:10 h", "?"]
     assert [duration(value) for value in seconds] == expected

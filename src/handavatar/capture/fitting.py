@@ -5,8 +5,8 @@ First the landmarks alone decide; then the mesh's outline is drawn to the mask's
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -23,6 +23,8 @@ from handavatar.hand.rig import Rig
 
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
 _PALM_LANDMARKS = (0, 1, 5, 9, 13, 17)
+_RETRY_GESTURES = ("fist", "relaxed", "pinch")
+_BAD_RATIO = 1.6
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,8 @@ class FitOptions:
     """Steps of the first stage."""
     outline_steps: int = 240
     """Steps of the second stage."""
+    retry_steps: int = 90
+    """Steps of every further attempt at a frame that fits badly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,8 +132,18 @@ class OutlinePairs:
     weights: Float[Tensor, "frames pairs"]
 
 
-PairFinder = Callable[[Float[Tensor, "frames vertices 3"], float], OutlinePairs]
-"""Pairs for posed vertices (metres, camera axes) and a focal length (pixels)."""
+class PairFinder(Protocol):
+    """Knows the outlines that were seen, one per frame."""
+
+    def __call__(
+        self, vertices: Float[Tensor, "frames vertices 3"], focal: float
+    ) -> OutlinePairs:
+        """Pairs for posed vertices (metres, camera axes) and a focal length (pixels)."""
+        ...
+
+    def chosen(self, frames: Int[Tensor, "chosen"]) -> "PairFinder":
+        """The same for some frames; they may repeat."""
+        ...
 
 
 class HandModel:
@@ -233,7 +247,59 @@ def fit_hands(
         fit = refined(
             model, observations, fit, options, steps=options.outline_steps, find_pairs=find_pairs
         )
+        fit = retried(model, observations, fit, options, find_pairs)
     return fit
+
+
+def retried(
+    model: HandModel,
+    observations: Observations,
+    fit: HandFit,
+    options: FitOptions,
+    find_pairs: PairFinder,
+) -> HandFit:
+    """Tries the worst explained frames again from other poses, and keeps what explains them best.
+
+    Other poses are those of the nearest well explained frames before and after, and gestures.
+    """
+    energy = frame_energy(model, observations, fit, options, find_pairs)
+    is_bad = energy > _BAD_RATIO * energy.median()
+    if not bool(is_bad.any()) or bool(is_bad.all()):
+        return fit
+    bad, good = is_bad.nonzero()[:, 0], (~is_bad).nonzero()[:, 0]
+    position = torch.searchsorted(good, bad)
+    before, after = good[(position - 1).clamp_min(0)], good[position.clamp_max(len(good) - 1)]
+    attempts = [fit.chosen(bad)]
+    for neighbour in (before, after):
+        attempts.append(replace(fit.chosen(bad), rotations=fit.rotations[neighbour]))
+    for gesture in _RETRY_GESTURES:
+        rotations = gesture_rotations(model.rig, gesture).repeat(len(bad), 1, 1)
+        rotations[:, 0] = fit.rotations[bad, 0]
+        attempts.append(replace(fit.chosen(bad), rotations=rotations))
+    repeated = bad.repeat(len(attempts))
+    seen, pairs = observations.chosen(repeated), find_pairs.chosen(repeated)
+    start = replace(
+        fit,
+        rotations=torch.cat([attempt.rotations for attempt in attempts]),
+        translation=torch.cat([attempt.translation for attempt in attempts]),
+    )
+    tried = refined(
+        model,
+        seen,
+        placed(model, seen, start),
+        options,
+        steps=options.retry_steps,
+        find_pairs=pairs,
+        learns_shape=False,
+    )
+    result = frame_energy(model, seen, tried, options, pairs).reshape(len(attempts), len(bad))
+    best = result.argmin(0)
+    is_better = result.amin(0) < 0.97 * energy[bad]
+    winner = (best * len(bad) + torch.arange(len(bad)))[is_better]
+    rotations, translation = fit.rotations.clone(), fit.translation.clone()
+    rotations[bad[is_better]] = tried.rotations[winner]
+    translation[bad[is_better]] = tried.translation[winner]
+    return replace(fit, rotations=rotations, translation=translation)
 
 
 def initial_fit(model: HandModel, observations: Observations, options: FitOptions) -> HandFit:

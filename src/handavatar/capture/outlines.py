@@ -87,9 +87,15 @@ class OutlineMatcher:
         """One outline per frame, in the order of the frames."""
         self._rig = rig
         self._outlines = outlines
+        self._picture_size = picture_size
         self._center = np.array(picture_size) / 2
         self._rim = rig.rim.numpy()
         self._generator = np.random.default_rng(0)
+
+    def chosen(self, frames: Int[Tensor, "chosen"]) -> "OutlineMatcher":
+        """The same for some frames; they may repeat."""
+        outlines = [self._outlines[frame] for frame in frames.tolist()]
+        return OutlineMatcher(self._rig, outlines, self._picture_size)
 
     def __call__(self, vertices: Float[Tensor, "frames vertices 3"], focal: float) -> OutlinePairs:
         """Pairs for vertices in camera axes (metres) and a focal length (pixels)."""
@@ -123,9 +129,8 @@ class OutlineMatcher:
         chosen, targets = np.zeros(size, dtype=np.int64), np.zeros((size, 2))
         directions, weights = np.zeros((size, 2)), np.zeros(size)
         places = vertices[:, :2] / np.maximum(vertices[:, 2:], 0.02) * focal + self._center
-        is_behind = wrist_line(places[self._rim], places.mean(0))
-
-        usable = np.nonzero(~is_behind(outline.points))[0]
+        is_behind = is_behind_wrist(outline.points, places[self._rim], places.mean(0))
+        usable = np.nonzero(~is_behind)[0]
         if len(usable) > _MAX_FROM_MASK:
             usable = self._generator.choice(usable, _MAX_FROM_MASK, replace=False)
         vertex, is_near = self._nearest_grazing(outline, usable, places, normals, facing)
@@ -167,22 +172,20 @@ class OutlineMatcher:
         return grazing[nearest], distance < _REACH * outline.pixels_per_metre
 
 
-@dataclass(frozen=True, eq=False)
-class wrist_line:
-    """The half of the picture behind the wrist; call it with points.
+def is_behind_wrist(
+    points: Float[np.ndarray, "*n 2"],
+    rim: Float[np.ndarray, "rim 2"],
+    hand: Float[np.ndarray, "2"],
+) -> Bool[np.ndarray, "*n"]:
+    """Whether image points lie on the forearm's side of the line through the mesh's end.
 
-    Attributes:
+    Args:
+        points: pixels.
         rim: where the mesh ends, pixels.
-        hand: centre of the hand, pixels.
+        hand: centre of the hand, pixels; the line is perpendicular to the way there.
     """
-
-    rim: Float[np.ndarray, "rim 2"]
-    hand: Float[np.ndarray, "2"]
-
-    def __call__(self, points: Float[np.ndarray, "*n 2"]) -> Bool[np.ndarray, "*n"]:
-        """Whether points (pixels) lie behind the line through the middle of the rim."""
-        center = self.rim.mean(0)
-        return (points - center) @ (self.hand - center) < 0
+    center = rim.mean(0)
+    return (points - center) @ (hand - center) < 0
 
 
 def window_camera(

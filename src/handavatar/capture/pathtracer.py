@@ -33,9 +33,9 @@ class Lights:
     at the scene's centre. Directions point from the centre to the light, in the world.
     """
 
-    key: float = 0.78
+    key: float = 0.74
     key_direction: tuple[float, float, float] = (-0.50, -0.58, -0.64)
-    key_size: float = 0.24
+    key_size: float = 0.18
     """side of the square, metres; larger is softer"""
     fill: float = 0.07
     fill_direction: tuple[float, float, float] = (0.1, -0.6, 0.8)
@@ -261,7 +261,7 @@ class HandTracer:
                 "component_format": "float32",
                 "rfilter": {"type": "box"},
             },
-            "sampler": {"type": "independent"},
+            "sampler": {"type": "multijitter"},
         }
 
     def _panel(

@@ -124,7 +124,7 @@ def smooth_noise(
     wavelength: Float64[np.ndarray, "3"],
     random: np.random.Generator,
 ) -> Float64[np.ndarray, "points"]:
-    """Smooth random values of about unit variance over space.
+    """Smooth random values over space, mean 0, mostly within -1 and 1 (deviation about 0.56).
 
     Args:
         points: where.
@@ -134,7 +134,6 @@ def smooth_noise(
     cells = points / wavelength
     cells = cells - cells.min(0) + 2
     grid = random.standard_normal(np.ceil(cells.max(0)).astype(int) + 3)
-    # The smoothing spline halves the deviation or so; the factor brings it back.
     return 1.7 * ndimage.map_coordinates(grid, cells.T, order=3, prefilter=False)
 
 
@@ -228,9 +227,9 @@ class _Painter:
             total = total + 0.5 * front * self.bump(pad, 9.0 * size)
         x = self.scale
         for center, radius, weight in (
-            ((-40, -25, 34), 14, 1.0),
-            ((-42, -22, -32), 14, 1.1),
-            ((-80, -18, 0), 16, 0.5),
+            ((-40, -25, 34), 14.0, 1.0),
+            ((-42, -22, -32), 14.0, 1.1),
+            ((-80, -18, 0), 16.0, 0.5),
         ):
             total = total + weight * front * self.bump(
                 x * np.array(center, float), float(x * radius)
@@ -310,7 +309,7 @@ class _Painter:
         vein = np.exp(-0.5 * (course / 0.17) ** 2) * _step(self.noise(25.0), -1.2, 0.4)
         back = _step(self.dorsal, 0.35, 0.8) * np.isin(self.bone, (0, 1, 4, 7, 10))
         from_wrist = -self.places[:, 0] / self.scale
-        return vein * back * _step(from_wrist, -5, 15) * _step(-from_wrist, -95, -70)
+        return vein * back * _step(from_wrist, -5.0, 15.0) * _step(-from_wrist, -95.0, -70.0)
 
     def spots(self) -> np.ndarray:
         total = np.zeros(len(self.places))

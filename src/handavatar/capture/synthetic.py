@@ -93,8 +93,8 @@ class SynthOptions:
     """frames of another motion through other poses"""
     size: int = 256
     """width and height of the pictures, pixels"""
-    samples: int = 128
-    """light paths per pixel"""
+    samples: int = 100
+    """light paths per pixel; spread evenly if it is a square number"""
     seed: int = 7
     """subject, skin and motion"""
     tone: float = 0.35
@@ -105,7 +105,7 @@ class SynthOptions:
     """rounds that refine the rig before it is displaced and rendered"""
     texture: int = 1024
     """texels along each side of the skin texture"""
-    full_truth: bool = True
+    geometry_truth: bool = False
     """store depth and normals too, not only albedo and shading"""
     variant: Variant = "auto"
     """of Mitsuba; auto takes llvm_ad_rgb where it works"""
@@ -155,8 +155,8 @@ def make_capture(
     base = load_open_hand()
     subject = make_subject(subdivided(base, options.subdivisions), options)
     motions = {
-        "train": training_motion(base, options.train_frames, options.seed),
-        "test": test_motion(base, options.test_frames, options.seed),
+        "train": motion_for_training(base, options.train_frames, options.seed),
+        "test": motion_for_testing(base, options.test_frames, options.seed),
     }
     writer = CaptureWriter(
         folder,
@@ -174,7 +174,7 @@ def make_capture(
         pictures = []
         for done, (frame, traced, maps) in enumerate(_frames(subject, motions, options), start=1):
             writer.add(frame)
-            _write_truth(writer, frame, traced, maps, options.full_truth)
+            _write_truth(writer, frame, traced, maps, options.geometry_truth)
             pictures.append(frame.image)
             on_progress(done, total)
         sheet = contact_sheet(pictures[:: max(1, total // 40)])
@@ -230,23 +230,23 @@ def _personal_displacement(rig: Rig, random: np.random.Generator) -> Float[Tenso
     total = 1.1 * smooth_noise(places, np.full(3, 38.0), random)
     total += 0.5 * smooth_noise(places, np.full(3, 15.0), random)
     for first, second, third in FINGER_BONES.values():
-        total += random.normal(1.6, 0.7) * back * bump(joints[first], 7)
-        total += random.normal(1.1, 0.6) * bump(joints[second], 6)
-        total += random.normal(0.4, 0.3) * bump(joints[third], 5)
+        total += random.normal(1.6, 0.7) * back * bump(joints[first], 7.0)
+        total += random.normal(1.1, 0.6) * bump(joints[second], 6.0)
+        total += random.normal(0.4, 0.3) * bump(joints[third], 5.0)
         middle = (joints[second] + joints[third]) / 2
-        total += random.normal(-0.2, 0.4) * bump(middle, 6)
+        total += random.normal(-0.2, 0.4) * bump(middle, 6.0)
     for center, radius, mean in (
-        ((-40, -25, 34), 15, 2.5),
-        ((-42, -20, -32), 16, 1.8),
-        ((-58, -20, -4), 13, -2.2),
+        ((-40, -25, 34), 15.0, 2.5),
+        ((-42, -20, -32), 16.0, 1.8),
+        ((-58, -20, -4), 13.0, -2.2),
     ):
         total += random.normal(mean, 0.8) * front * bump(np.array(center, float), radius)
     # The wrist's rim stays where the rig has it.
-    total *= 1 - bump(joints[0], 12)
+    total *= 1 - bump(joints[0], 12.0)
     return torch.from_numpy(total.clip(-3.5, 3.5) / 1000).float()
 
 
-def training_motion(rig: Rig, steps: int, seed: int) -> Motion:
+def motion_for_training(rig: Rig, steps: int, seed: int) -> Motion:
     """Curling over the palm, thumb opposition and free poses while the hand turns all the way."""
     generator = torch.Generator().manual_seed(seed)
     free = sample_poses(rig, 10, generator)
@@ -261,7 +261,7 @@ def training_motion(rig: Rig, steps: int, seed: int) -> Motion:
     return _turning(rig, fingers, yaw, 32 * _wave(share, 2.6, 0.35), 28 * _wave(share, 5.2, 0.6))
 
 
-def test_motion(rig: Rig, steps: int, seed: int) -> Motion:
+def motion_for_testing(rig: Rig, steps: int, seed: int) -> Motion:
     """Other gestures and poses than the training motion's, in similar orientations."""
     generator = torch.Generator().manual_seed(seed + 1000)
     free = sample_poses(rig, 4, generator)
@@ -352,7 +352,7 @@ def _write_subject(writer: CaptureWriter, subject: Subject, options: SynthOption
 
 
 def _write_truth(
-    writer: CaptureWriter, frame: Frame, traced: Traced, maps: SurfaceMaps, full: bool
+    writer: CaptureWriter, frame: Frame, traced: Traced, maps: SurfaceMaps, geometry: bool
 ) -> None:
     mask = frame.mask.float()
     albedo = srgb_from_linear(maps.albedo) * mask[..., None]
@@ -365,7 +365,7 @@ def _write_truth(
 
     save("albedo", _eight_bits(albedo).numpy())
     save("shading", _eight_bits(shading).numpy())
-    if full:
+    if geometry:
         tenths = (maps.depth * 1e4 * mask).round().clamp(0, 65535)
         save("depth", tenths.numpy().astype(np.uint16))
         save("normals", _eight_bits((maps.normals + 1) / 2 * mask[..., None]).numpy())

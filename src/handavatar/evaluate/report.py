@@ -186,7 +186,7 @@ def _data_url(pixels: UInt8[np.ndarray, "height width *channels"]) -> str:
 
 def _curve_svg(curve: Curve) -> str:
     """A line chart with round ticks."""
-    points = [(x, y) for x, y in curve.points if math.isfinite(x) and math.isfinite(y)]
+    points = [(float(x), y) for x, y in curve.points if math.isfinite(x) and math.isfinite(y)]
     if len(points) < 2:
         return ""
     x_ticks = _ticks(min(x for x, _ in points), max(x for x, _ in points))
@@ -215,7 +215,9 @@ def _curve_svg(curve: Curve) -> str:
     )
 
 
-def _thinned(points: Sequence[tuple[int, float]], limit: int = 600) -> Sequence[tuple[int, float]]:
+def _thinned(
+    points: Sequence[tuple[float, float]], limit: int = 600
+) -> Sequence[tuple[float, float]]:
     """At most about ``limit`` points, evenly chosen, the last one always among them."""
     stride = max(1, math.ceil(len(points) / limit))
     return [*points[:-1][::stride], points[-1]]
@@ -225,7 +227,7 @@ def _ticks(lowest: float, highest: float) -> list[float]:
     """Three to seven round numbers that enclose the range."""
     span = highest - lowest or abs(highest) or 1.0
     rough = span / 4
-    power = 10 ** math.floor(math.log10(rough))
+    power = 10.0 ** math.floor(math.log10(rough))
     step = next(factor * power for factor in (1, 2, 2.5, 5, 10) if factor * power >= rough)
     first, last = math.floor(lowest / step), math.ceil(highest / step)
     last = max(last, first + 1)

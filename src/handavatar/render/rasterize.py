@@ -47,8 +47,8 @@ def rasterize(
 
     A face covers a pixel if the pixel's centre lies in its closed projection; of several faces
     the nearest wins, of equally near ones (to float32) the first. Neighbouring faces leave no
-    gap: the test of a shared edge is antisymmetric to the last bit. Faces without projected area
-    and faces that reach ``NEAR_PLANE`` are skipped.
+    gap: the test of a shared edge is antisymmetric to the last bit. Faces without projected area,
+    faces that reach ``NEAR_PLANE`` and faces with a vertex that is not finite are skipped.
 
     Args:
         vertices: metres, world.
@@ -63,7 +63,7 @@ def rasterize(
         dtype=torch.int64,
         device=vertices.device,
     )
-    drawn = (corner_depths > NEAR_PLANE).all(-1).nonzero()[:, 0]
+    drawn = is_before_camera(corner_depths).nonzero()[:, 0]
     lower, upper = corners[drawn].amin(1), corners[drawn].amax(1)
     for row, x, y in pixels_in_boxes(lower, upper, camera.width, camera.height):
         face = drawn[row]
@@ -88,6 +88,11 @@ def interpolate(
     corner_values = vertex_values[faces[fragments.face_index.clamp_min(0)]]
     weights = fragments.barycentric.to(vertex_values.dtype)
     return (corner_values * weights[..., None]).sum(-2)
+
+
+def is_before_camera(corner_depths: Float[Tensor, "faces 3"]) -> Bool[Tensor, "faces"]:
+    """Faces whose corners all lie beyond ``NEAR_PLANE``, at a finite depth."""
+    return ((corner_depths > NEAR_PLANE) & (corner_depths < torch.inf)).all(-1)
 
 
 def pixels_in_boxes(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from handavatar.geometry.cameras import Camera, project
 from handavatar.render.rasterize import (
-    NEAR_PLANE,
+    is_before_camera,
     numbered_copies,
     pixels_in_boxes,
     rasterize,
@@ -23,8 +23,11 @@ WINDOW = 3.0
 """In units of the softness: farther from the outline the coverage is 0 or 1, which is wrong by
 at most ``sigmoid(-WINDOW ** 2)`` = 1.2e-4."""
 
+# Pixels; the middle of a piece speaks for all of it.
 _LONGEST_PIECE = 1.0
+# Of one edge: a face just in front of the camera plane projects to millions of pixels.
 _MOST_PIECES = 4096
+# Pixels; how far beside a contour is looked for other parts of the mesh.
 _STEP_ACROSS = 0.01
 
 
@@ -59,7 +62,7 @@ def soft_silhouette(
     width, height = camera.width, camera.height
     covered = rasterize(vertices, faces, camera).mask.reshape(-1)
     pixels, depths = project(camera, vertices)
-    seen = faces[(depths[faces] > NEAR_PLANE).all(-1)]
+    seen = faces[is_before_camera(depths[faces])]
     outline = _outline(pixels.detach(), seen, WINDOW * softness, width, height)
     pixel, piece = _nearest_pieces(outline, pixels.detach(), WINDOW * softness, width, height)
 

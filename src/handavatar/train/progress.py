@@ -9,8 +9,9 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
+from io import TextIOBase
 from types import TracebackType
-from typing import TextIO
+from typing import IO, cast
 
 from rich.console import Console
 from rich.live import Live
@@ -34,7 +35,7 @@ class Progress:
         job: str,
         total: int,
         done: int = 0,
-        stream: TextIO | None = None,
+        stream: TextIOBase | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Starts the clock.
@@ -47,7 +48,7 @@ class Progress:
             clock: seconds, ever growing.
         """
         self._job, self._total, self._step = job, total, done
-        self._stream = stream or sys.stderr
+        self._stream = cast(IO[str], stream or sys.stderr)
         self._clock = clock
         self._marks: deque[tuple[float, int]] = deque([(clock(), done)])
         self._figures: dict[str, float] = {}

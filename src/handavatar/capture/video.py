@@ -1,0 +1,356 @@
+"""A person's own video of one hand, made into a capture: track, mask, fit, crop, write."""
+
+import json
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image, ImageDraw
+from scipy import ndimage
+from torch import Tensor
+
+from handavatar.capture.checks import CaptureError
+from handavatar.capture.decoding import video_frames
+from handavatar.capture.fitting import (
+    FitOptions,
+    HandFit,
+    HandModel,
+    Observations,
+    fit_hands,
+    landmark_errors,
+)
+from handavatar.capture.frames import Capture, CaptureWriter, Frame, read_capture
+from handavatar.capture.masks import HandMask, find_mask, learn_colors, pixels_per_metre
+from handavatar.capture.outlines import (
+    OutlineMatcher,
+    is_behind_wrist,
+    mask_outline,
+    silhouette,
+    window_camera,
+)
+from handavatar.capture.tracking import TrackedHand, Track, resampled, track_hand
+from handavatar.geometry.cameras import Camera, project
+from handavatar.hand.open_hand import load_open_hand
+from handavatar.hand.rig import Rig
+
+Progress = Callable[[float, str], None]
+"""Told the share of the work that is done, in [0, 1], and what is being done."""
+
+_BOX_SCALE = 1.3
+_HELD_OUT = ((0.28, 0.08), (0.68, 0.08))
+_MIN_KEPT = 8
+_SHEET_TILE = 192
+_SHEET_COLUMNS = 9
+_SHEET_FRAMES = 63
+
+
+@dataclass(frozen=True)
+class VideoOptions:
+    """From a video file to a capture."""
+
+    file: Path
+    """The video: mp4, mov, mkv or webm; one bare hand, whole, well lit."""
+    out: Path
+    """Folder of the capture."""
+    fps: float = 10.0
+    """Pictures taken per second of video."""
+    max_frames: int = 600
+    """Stop after this many pictures."""
+    side: Literal["auto", "left", "right"] = "auto"
+    """Which hand it is; auto takes the video as not mirrored."""
+    size: int = 256
+    """Side of the stored pictures, pixels."""
+    min_confidence: float = 0.5
+    """Frames whose pose is less sure are left out, by name."""
+    subject: str = "unnamed"
+    """Whose hand it is."""
+    licence: str = "private"
+    """Terms under which the video may be used."""
+    overwrite: bool = False
+    """Replace a capture that is already in the folder."""
+    fit: FitOptions = field(default_factory=FitOptions)
+    """How the hand is fitted."""
+
+
+@dataclass(frozen=True, eq=False)
+class VideoFrameResult:
+    """What became of one picture in which the hand was found.
+
+    Attributes:
+        frame: cropped picture, cut mask, camera, pose; its split is set when it is written.
+        mesh: pixels that the fitted hand covers.
+        mask_iou: agreement of mask and mesh in front of the wrist, intersection over union.
+        landmark_error: mean distance of fitted and tracked landmarks, pixels of the crop.
+    """
+
+    frame: Frame
+    mesh: Bool[np.ndarray, "height width"]
+    mask_iou: float
+    landmark_error: float
+
+
+def capture_video(
+    options: VideoOptions, rig: Rig | None = None, progress: Progress | None = None
+) -> Capture:
+    """Makes a capture of a video of one hand.
+
+    Poses come from landmarks and masks alone, in held-out frames as in all others. World axes are
+    those of the camera, which is taken as standing still.
+
+    Args:
+        options: which video, where to, how.
+        rig: the hand to lay onto the pictures; the open hand if None.
+        progress: called now and then.
+
+    Returns:
+        The capture as written. Frames that were left out stand with their reason in its
+        ``skipped.json``, the agreement of every frame in ``fit.json``.
+
+    Raises:
+        CaptureError: the video cannot be used, the folder is in use, or an extra is missing.
+    """
+    report = progress or (lambda share, doing: None)
+    rig = rig or load_open_hand()
+    header = {
+        "rig_name": rig.name,
+        "rig_sha256": rig.sha256,
+        "subject": options.subject,
+        "source": options.file.name,
+        "licence": options.licence,
+        "overwrite": options.overwrite,
+    }
+    CaptureWriter(options.out, **header)  # type: ignore[arg-type]  # refuses a folder in use now
+    frames = video_frames(options.file, options.fps, options.max_frames)
+    track = track_hand(
+        frames, options.side, lambda done, _: report(0.4 * done / (done + 60), "finding the hand")
+    )
+    masks = _found_masks(track, report)
+    fit, results = _fitted(track, masks, rig, options, report)
+    report(0.95, "writing")
+    skipped = {f"{index:06d}": reason for index, reason in track.skipped.items()}
+    for result in results:
+        if result.frame.confidence < options.min_confidence:
+            skipped[result.frame.name] = f"unsure pose: confidence {result.frame.confidence:.2f}"
+    kept = [result for result in results if result.frame.name not in skipped]
+    if len(kept) < _MIN_KEPT:
+        raise CaptureError(
+            f"{options.file}: only {len(kept)} of {len(results) + len(track.skipped)} pictures "
+            f"could be fitted with confidence; at least {_MIN_KEPT} are needed",
+            "record slower movements, in better light, before a plain background",
+        )
+    splits = _splits(len(kept))
+    with CaptureWriter(
+        options.out,
+        side=track.side,
+        shape_coefficients=fit.shape_coefficients,
+        **header,  # type: ignore[arg-type]
+    ) as writer:
+        for result, split in zip(kept, splits, strict=True):
+            writer.add(_with_split(result.frame, split))
+        _save_json(writer.file("skipped.json"), skipped)
+        _save_json(writer.file("fit.json"), _summary(results, fit))
+        _overview(results, set(skipped)).save(writer.file("overview.png"))
+    report(1.0, "done")
+    return read_capture(options.out)
+
+
+def _found_masks(track: Track, report: Progress) -> list[HandMask]:
+    report(0.4, "learning the colour of the skin")
+    colors = learn_colors(track.hands)
+    masks: list[HandMask] = []
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        for mask in pool.map(lambda hand: find_mask(hand, colors), track.hands):
+            masks.append(mask)
+            report(0.4 + 0.25 * len(masks) / len(track.hands), "cutting out the hand")
+    return masks
+
+
+def observations_of(track: Track) -> Observations:
+    """What the tracker saw, as tensors."""
+
+    def stacked(values: list[object]) -> Tensor:
+        return torch.from_numpy(np.array(values)).float()
+
+    return Observations(
+        landmarks=stacked([hand.landmarks for hand in track.hands]),
+        uncertainty=stacked([hand.spread for hand in track.hands]),
+        world_landmarks=stacked([hand.world_landmarks for hand in track.hands]),
+        scale=stacked([pixels_per_metre(hand) for hand in track.hands]),
+        times=stacked([hand.time for hand in track.hands]),
+        picture_size=track.picture_size,
+    )
+
+
+def _fitted(
+    track: Track, masks: list[HandMask], rig: Rig, options: VideoOptions, report: Progress
+) -> tuple[HandFit, list[VideoFrameResult]]:
+    report(0.65, "fitting the hand")
+    observations = observations_of(track)
+    outlines = [
+        mask_outline(mask.pixels, hand.window, float(scale))
+        for hand, mask, scale in zip(track.hands, masks, observations.scale, strict=True)
+    ]
+    matcher = OutlineMatcher(rig, outlines, track.picture_size)
+    fit = fit_hands(rig, observations, options.fit, matcher)
+    report(0.85, "cropping")
+    model = HandModel(rig)
+    vertices = model.all_vertices(fit)
+    errors = landmark_errors(model, observations, fit)
+    results = []
+    for number, (hand, mask) in enumerate(zip(track.hands, masks, strict=True)):
+        error_metres = float(errors[number] / observations.scale[number])
+        result = _result(hand, mask, rig, fit, number, vertices[number], error_metres, options.size)
+        results.append(result)
+        report(0.85 + 0.1 * number / len(masks), "cropping")
+    return fit, results
+
+
+def _result(
+    hand: TrackedHand,
+    mask: HandMask,
+    rig: Rig,
+    fit: HandFit,
+    number: int,
+    vertices: Float[Tensor, "vertices 3"],
+    error_metres: float,
+    size: int,
+) -> VideoFrameResult:
+    """One frame's crop, with its mask cut where the mesh ends."""
+    window = hand.window
+    side = window.image.shape[0]
+    whole = window_camera(
+        fit.focal, window.picture_size, window.corner, side / window.scale, side
+    )
+    cut = _cut_mask(mask.pixels, rig, vertices, whole)
+    corner, box = _box(cut)
+    image = resampled(window.image, np.eye(2) * (box / size), np.array(corner), size)
+    camera = whole.cropped(*corner, box, box).resized(size, size)
+    camera = Camera(
+        tuple(f * size / box for f in whole.focal),  # type: ignore[arg-type]
+        tuple((c - o) * size / box for c, o in zip(whole.center, corner, strict=True)),  # type: ignore[arg-type]
+        size,
+        size,
+        whole.camera_from_world,
+    )
+    soft = (mask.pixels * np.uint8(255))[..., None].repeat(3, axis=-1)
+    full = resampled(soft, np.eye(2) * (box / size), np.array(corner), size)[..., 0] > 127
+    cut = _cut_mask(full, rig, vertices, camera)
+    mesh = silhouette(rig, vertices, camera)
+    iou = float((mesh & cut).sum() / max(1, int((mesh | cut).sum())))
+    frame = Frame(
+        name=f"{hand.index:06d}",
+        image=torch.from_numpy(image.copy()),
+        mask=torch.from_numpy(cut),
+        camera=camera,
+        pose=fit.pose(number),
+        confidence=_confidence(hand, mask, iou, error_metres),
+        split="train",
+        time=hand.time,
+    )
+    crop_scale = pixels_per_metre(hand) * window.scale * size / box
+    return VideoFrameResult(frame, mesh, iou, error_metres * crop_scale)
+
+
+def _confidence(hand: TrackedHand, mask: HandMask, iou: float, error_metres: float) -> float:
+    """How far a pose is to be trusted: 1 if outline, landmarks and tracker all agree."""
+    spread_metres = float(hand.spread.mean()) / pixels_per_metre(hand)
+    outline = np.clip((iou - 0.65) / 0.25, 0, 1)
+    landmarks = np.exp(-((error_metres / 0.010) ** 2))
+    agreement = np.exp(-((spread_metres / 0.015) ** 2))
+    is_clear = np.clip((mask.quality - 0.5) / 0.35, 0, 1)
+    presence = np.clip(hand.presence / 0.9, 0, 1)
+    return float(outline * landmarks * agreement * is_clear * presence)
+
+
+def _cut_mask(
+    mask: Bool[np.ndarray, "side side"],
+    rig: Rig,
+    vertices: Float[Tensor, "vertices 3"],
+    camera: Camera,
+) -> Bool[np.ndarray, "side side"]:
+    """The mask without the forearm: nothing behind the wrist but what the mesh covers."""
+    places = project(camera, vertices)[0].numpy()
+    rows, columns = np.nonzero(mask)
+    centers = np.stack([columns, rows], axis=-1) + 0.5
+    behind = is_behind_wrist(centers, places[rig.rim.numpy()], places.mean(0))
+    rows, columns = rows[behind], columns[behind]
+    cut = mask.copy()
+    cut[rows, columns] = silhouette(rig, vertices, camera)[rows, columns]
+    return cut
+
+
+def _box(mask: Bool[np.ndarray, "side side"]) -> tuple[tuple[float, float], float]:
+    """Corner and side of the square about a mask, with room on every side."""
+    rows, columns = np.nonzero(mask)
+    if len(rows) == 0:
+        return (0.0, 0.0), float(mask.shape[0])
+    low = np.array([columns.min(), rows.min()])
+    high = np.array([columns.max(), rows.max()]) + 1
+    side = float((high - low).max()) * _BOX_SCALE
+    x, y = (low + high) / 2 - side / 2
+    return (float(x), float(y)), side
+
+
+def _splits(count: int) -> list[str]:
+    """Two stretches of time are held out, together a sixth of the frames."""
+    splits = ["train"] * count
+    for start, share in _HELD_OUT:
+        first, length = round(start * count), int(np.ceil(share * count))
+        splits[first : first + length] = ["test"] * length
+    return splits
+
+
+def _with_split(frame: Frame, split: str) -> Frame:
+    return Frame(**{**vars(frame), "split": split})
+
+
+def _summary(results: list[VideoFrameResult], fit: HandFit) -> dict[str, object]:
+    return {
+        "focal_pixels": fit.focal,
+        "mean_mask_iou": float(np.mean([result.mask_iou for result in results])),
+        "mean_landmark_error_pixels": float(np.mean([r.landmark_error for r in results])),
+        "frames": {
+            result.frame.name: {
+                "confidence": round(result.frame.confidence, 4),
+                "mask_iou": round(result.mask_iou, 4),
+                "landmark_error_pixels": round(result.landmark_error, 3),
+            }
+            for result in results
+        },
+    }
+
+
+def _save_json(path: Path, content: object) -> None:
+    path.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
+
+
+def _overview(results: list[VideoFrameResult], skipped: set[str]) -> Image.Image:
+    """Contact sheet: mask outline green, mesh outline red, what was left out framed in red."""
+    step = max(1, -(-len(results) // _SHEET_FRAMES))
+    shown = results[::step]
+    rows = -(-len(shown) // _SHEET_COLUMNS)
+    sheet = Image.new("RGB", (_SHEET_COLUMNS * _SHEET_TILE, rows * _SHEET_TILE))
+    for place, result in enumerate(shown):
+        tile = Image.fromarray(_drawn_outlines(result)).resize((_SHEET_TILE, _SHEET_TILE))
+        draw = ImageDraw.Draw(tile)
+        text = f"{result.frame.name}  {result.frame.confidence:.2f}"
+        draw.text((4, 3), text, fill="white", stroke_width=1, stroke_fill="black")
+        if result.frame.name in skipped:
+            draw.rectangle((0, 0, _SHEET_TILE - 1, _SHEET_TILE - 1), outline="red", width=3)
+        row, column = divmod(place, _SHEET_COLUMNS)
+        sheet.paste(tile, (column * _SHEET_TILE, row * _SHEET_TILE))
+    return sheet
+
+
+def _drawn_outlines(result: VideoFrameResult) -> UInt8[np.ndarray, "height width 3"]:
+    image = result.frame.image.numpy().copy()
+    mask = result.frame.mask.numpy()
+    image[mask ^ ndimage.binary_erosion(mask)] = (0, 255, 0)
+    image[result.mesh ^ ndimage.binary_erosion(result.mesh)] = (255, 40, 40)
+    return image

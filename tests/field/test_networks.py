@@ -1,0 +1,52 @@
+"""Building blocks: encodings and small networks."""
+
+import math
+
+import torch
+
+from handavatar.field.layers import MLP, PointNet, ResidualBlock, SkipMLP, positional_encoding
+
+
+def test_the_encoding_agrees_with_its_formula() -> None:
+    positions = torch.rand(4, 3, generator=torch.Generator().manual_seed(0)).double()
+    found = positional_encoding(positions, 3)
+    assert found.shape == (4, 21)
+    for row, point in enumerate(positions.tolist()):
+        expected = [*point]
+        for function in (math.sin, math.cos):
+            expected += [function(2**k * math.pi * x) for k in range(3) for x in point]
+        torch.testing.assert_close(found[row], torch.tensor(expected).double())
+
+
+def test_a_residual_block_starts_as_its_shortcut() -> None:
+    torch.manual_seed(0)
+    block, inputs = ResidualBlock(8, 4), torch.randn(5, 8)
+    with torch.no_grad():
+        block.outer.bias.zero_()
+    torch.testing.assert_close(block(inputs), block.shortcut(inputs))
+
+
+def test_a_pooled_pointnet_ignores_order_and_repetition() -> None:
+    torch.manual_seed(0)
+    network, points = PointNet(6), torch.randn(2, 30, 6)
+    shuffled = points[:, torch.randperm(30)]
+    repeated = torch.cat([points, points[:, :7]], dim=1)
+    code = network(points)
+    assert code.shape == (2, 64)
+    torch.testing.assert_close(network(shuffled), code)
+    torch.testing.assert_close(network(repeated), code)
+
+
+def test_an_unpooled_pointnet_follows_the_order() -> None:
+    torch.manual_seed(0)
+    network, points = PointNet(6, is_pooled=False), torch.randn(3, 2, 6)
+    features = network(points)
+    assert features.shape == (3, 2, 64)
+    torch.testing.assert_close(network(points.flip(1)), features.flip(1))
+
+
+def test_depth_counts_hidden_layers() -> None:
+    network = MLP(5, 16, 4, 2)
+    assert len(network.hidden) == 4 and network(torch.zeros(3, 5)).shape == (3, 2)
+    widths = [(layer.in_features, layer.out_features) for layer in SkipMLP(64, 128, 1).layers]
+    assert widths == [(64, 128), (128, 64), (128, 128), (128, 128)]

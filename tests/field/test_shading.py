@@ -1,0 +1,73 @@
+"""Directed soft occupancy, albedo and illumination."""
+
+import torch
+from torch import Tensor
+
+from handavatar.field.anchors import Neighbours
+from handavatar.field.shading import AlbedoField, IlluminationField, directed_occupancy
+from handavatar.hand.pose import NUM_BONES
+
+
+def _soft(rays: int = 5, samples: int = 9) -> Tensor:
+    generator = torch.Generator().manual_seed(0)
+    return torch.rand(rays, samples, NUM_BONES, generator=generator)
+
+
+def test_directed_occupancy_agrees_with_equation_4_as_printed() -> None:
+    soft = _soft()
+    found = directed_occupancy(soft)
+    for ray in range(5):
+        for sample in range(9):
+            for bone in range(NUM_BONES):
+                met = [float(soft[ray, i, bone]) for i in range(sample + 1)]
+                assert float(found[ray, sample, bone]) == max(met)
+
+
+def test_directed_is_at_least_soft_and_never_falls_along_the_ray() -> None:
+    soft = _soft()
+    found = directed_occupancy(soft)
+    assert bool((found >= soft).all())
+    assert bool((found[:, 1:] >= found[:, :-1]).all())
+    assert torch.equal(found[:, 0], soft[:, 0])
+
+
+def test_what_lies_behind_a_sample_does_not_darken_it() -> None:
+    soft = _soft()
+    changed = soft.clone()
+    changed[:, 5:] = 1
+    assert torch.equal(directed_occupancy(changed)[:, :5], directed_occupancy(soft)[:, :5])
+
+
+def _neighbours(queries: int = 6, anchors: int = 50) -> Neighbours:
+    generator = torch.Generator().manual_seed(1)
+    weights = torch.rand(queries, 4, generator=generator)
+    indices = torch.randint(anchors, (queries, 4), generator=generator)
+    return Neighbours(indices, weights / weights.sum(-1, keepdim=True))
+
+
+def test_albedo_and_illumination_are_in_range_and_of_the_papers_sizes() -> None:
+    torch.manual_seed(0)
+    albedo = AlbedoField(50)
+    illumination = IlluminationField(torch.rand(50, 3))
+    color = albedo(_neighbours())
+    light = illumination(torch.zeros(NUM_BONES, 3), _neighbours(), torch.rand(6, NUM_BONES))
+    for value in (color, light):
+        assert 0 <= float(value.min()) <= float(value.max()) <= 1
+    assert color.shape == (6, 3) and light.shape == (6,)
+    # Paper appendix, the table of MLPs: 128 -> 4 x 256 -> 3 and 85 -> 4 x 256 -> 1.
+    assert albedo.codes.shape == (50, 128) and albedo.mlp.hidden[0].in_features == 128
+    assert illumination.mlp.hidden[0].in_features == 85
+    assert illumination.position_codes.shape == (50, 21)
+    for mlp in (albedo.mlp, illumination.mlp):
+        assert [layer.out_features for layer in mlp.hidden] == [256] * 4
+
+
+def test_albedo_depends_on_place_alone_and_light_on_pose_and_shadow_too() -> None:
+    torch.manual_seed(0)
+    field, there = IlluminationField(torch.rand(50, 3)), _neighbours()
+    flat = torch.zeros(NUM_BONES, 3)
+    clear = torch.zeros(6, NUM_BONES)
+    light = field(flat, there, clear)
+    assert not torch.allclose(light, field(flat + 0.5, there, clear))
+    assert not torch.allclose(light, field(flat, there, clear + 0.5))
+    assert torch.equal(AlbedoField(50).eval()(there).shape and light, field(flat, there, clear))

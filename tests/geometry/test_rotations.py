@@ -1,0 +1,90 @@
+"""Rotations and rigid transforms: laws, scipy as reference, gradients at the delicate points."""
+
+import math
+
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from handavatar.geometry.rotations import (
+    apply_rigid,
+    axis_angle_from_matrix,
+    invert_rigid,
+    matrix_from_axis_angle,
+    quaternion_from_matrix,
+    rigid_transform,
+    skew,
+)
+
+
+def _axis_angles(count: int = 200) -> torch.Tensor:
+    """Random axes; angles from 0 to pi, both ends and tiny ones included."""
+    generator = torch.Generator().manual_seed(0)
+    axes = torch.nn.functional.normalize(
+        torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=-1
+    )
+    angles = math.pi * torch.rand(count, 1, generator=generator, dtype=torch.float64)
+    ends = [0, 1e-12, 1e-6, 1e-3, math.pi - 1e-6, math.pi]
+    angles[:6, 0] = torch.tensor(ends, dtype=torch.float64)
+    return axes * angles
+
+
+def test_matrices_agree_with_scipy() -> None:
+    axis_angles = _axis_angles()
+    expected = torch.from_numpy(Rotation.from_rotvec(axis_angles.numpy()).as_matrix())
+    torch.testing.assert_close(matrix_from_axis_angle(axis_angles), expected, atol=1e-12, rtol=0)
+
+
+def test_axis_angles_return_at_zero_and_at_pi() -> None:
+    axis_angles = _axis_angles()
+    found = axis_angle_from_matrix(matrix_from_axis_angle(axis_angles))
+    # At pi both axes are right.
+    same = (found - axis_angles).norm(dim=-1)
+    opposite = (found + axis_angles).norm(dim=-1)
+    is_half_turn = axis_angles.norm(dim=-1) > math.pi - 1e-3
+    assert float(torch.where(is_half_turn, torch.minimum(same, opposite), same).max()) < 1e-7
+
+
+def test_rotations_keep_lengths_and_orientation() -> None:
+    matrix = matrix_from_axis_angle(_axis_angles())
+    identity = torch.eye(3, dtype=torch.float64).expand_as(matrix)
+    torch.testing.assert_close(matrix @ matrix.transpose(-1, -2), identity, atol=1e-12, rtol=0)
+    torch.testing.assert_close(matrix.det(), torch.ones(len(matrix), dtype=torch.float64))
+
+
+def test_quaternions_agree_with_scipy() -> None:
+    matrix = matrix_from_axis_angle(_axis_angles())
+    expected = torch.from_numpy(Rotation.from_matrix(matrix.numpy()).as_quat(canonical=True))
+    expected = expected[:, [3, 0, 1, 2]]
+    found = quaternion_from_matrix(matrix)
+    dot = (found * expected).sum(-1).abs()  # q and -q are the same rotation
+    torch.testing.assert_close(dot, torch.ones_like(dot))
+    assert float(found[:, 0].min()) >= 0
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 5e-5, 1e-3, 1.0, 3.1])
+def test_the_gradient_is_right_at_every_angle(angle: float) -> None:
+    axis = torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64)
+    axis_angle = (angle * axis).requires_grad_()
+    assert torch.autograd.gradcheck(matrix_from_axis_angle, (axis_angle,), eps=1e-7, atol=1e-6)
+
+
+def test_skew_is_the_cross_product() -> None:
+    a, b = torch.randn(2, 5, 3, generator=torch.Generator().manual_seed(1))
+    product = (skew(a) @ b[..., None])[..., 0]
+    torch.testing.assert_close(product, torch.linalg.cross(a, b))
+
+
+def test_rigid_transforms_compose_and_invert() -> None:
+    generator = torch.Generator().manual_seed(2)
+    a, b = (
+        rigid_transform(
+            matrix_from_axis_angle(_axis_angles(7)[torch.randperm(7, generator=generator)]),
+            torch.randn(7, 3, generator=generator, dtype=torch.float64),
+        )
+        for _ in range(2)
+    )
+    points = torch.randn(7, 11, 3, generator=generator, dtype=torch.float64)
+    torch.testing.assert_close(apply_rigid(a @ b, points), apply_rigid(a, apply_rigid(b, points)))
+    torch.testing.assert_close(apply_rigid(invert_rigid(a), apply_rigid(a, points)), points)
+    torch.testing.assert_close(invert_rigid(a), torch.linalg.inv(a))
