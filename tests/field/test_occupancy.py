@@ -1,4 +1,4 @@
-"""The pair occupancy field: the paper's equations, and the fast evaluation against the plain one."""
+"""The pair occupancy field: the paper's equations, and the fast against the plain evaluation."""
 
 import math
 

@@ -66,9 +66,9 @@ def test_on_a_terminal_one_line_with_psnr_and_time_left() -> None:
     stream, clock = _Terminal(), _Clock()
     with Progress("train", 100, stream=stream, clock=clock) as progress:
         clock.now += 10.0
-        progress.update(50, psnr=21.239)
+        progress.update(50, "second stage", psnr=21.239)
     text = stream.getvalue()
-    for part in ("train 50/100", "5.0 steps/s", "PSNR 21.24 dB", "10 s left"):
+    for part in ("train 50/100", "5.0 steps/s", "PSNR 21.24 dB", "10 s left", "second stage"):
         assert part in text
 
 

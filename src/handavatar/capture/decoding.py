@@ -142,12 +142,6 @@ def _expected_seconds(
 def _upright(frame: av.VideoFrame) -> UInt8[np.ndarray, "height width 3"]:
     """SRGB picture with the recording phone's rotation undone, at working size."""
     scale = min(1.0, _MAX_WORKING_SIDE / max(frame.width, frame.height))
-    if scale < 1:
-        even = [2 * round(side * scale / 2) for side in (frame.width, frame.height)]
-        frame_rotation = frame.rotation
-        image = frame.reformat(width=even[0], height=even[1], format="rgb24").to_ndarray()
-    else:
-        frame_rotation = frame.rotation
-        image = frame.to_ndarray(format="rgb24")
-    quarter_turns = round(frame_rotation / 90) % 4
-    return np.ascontiguousarray(np.rot90(image, quarter_turns))
+    width, height = (2 * round(side * scale / 2) for side in (frame.width, frame.height))
+    image = frame.to_ndarray(format="rgb24", width=width, height=height)
+    return np.ascontiguousarray(np.rot90(image, round(frame.rotation / 90) % 4))

@@ -135,9 +135,7 @@ class OutlinePairs:
 class PairFinder(Protocol):
     """Knows the outlines that were seen, one per frame."""
 
-    def __call__(
-        self, vertices: Float[Tensor, "frames vertices 3"], focal: float
-    ) -> OutlinePairs:
+    def __call__(self, vertices: Float[Tensor, "frames vertices 3"], focal: float) -> OutlinePairs:
         """Pairs for posed vertices (metres, camera axes) and a focal length (pixels)."""
         ...
 

@@ -7,6 +7,7 @@ frame. The result holds the forearm as well; where the hand ends is decided by t
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -192,7 +193,8 @@ def learn_colors(hands: Sequence[TrackedHand], seed: int = 0, num_frames: int = 
     """
     generator = np.random.default_rng(seed)
     chosen = _sure_and_spread(hands, num_frames)
-    inside, outside = [], []
+    inside: list[np.ndarray] = []
+    outside: list[np.ndarray] = []
     for hand in chosen:
         regions = _regions(hand)
         image = hand.window.image
@@ -244,7 +246,7 @@ def find_mask(hand: TrackedHand, colors: ColorModel) -> HandMask:
 
 def pixels_per_metre(hand: TrackedHand) -> float:
     """Scale of a tracked hand: picture pixels per metre at its depth."""
-    pairs = [(a, b) for chain in _FINGER_CHAINS for a, b in zip(chain[:-1], chain[1:], strict=True)]
+    pairs = [(a, b) for chain in _FINGER_CHAINS for a, b in pairwise(chain)]
     pairs += [(0, 5), (0, 9), (0, 13), (0, 17)]
     first, second = np.array(pairs).T
     picture = np.linalg.norm(hand.landmarks[first] - hand.landmarks[second], axis=-1)
@@ -271,9 +273,9 @@ def _graph_cut(
     labels = labels.copy()
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.setRNGSeed(0)
-    cv2.grabCut(
-        np.ascontiguousarray(image), labels, None, *models, _CUT_ROUNDS, cv2.GC_INIT_WITH_MASK
-    )
+    unused = (0, 0, 0, 0)
+    picture = np.ascontiguousarray(image)
+    cv2.grabCut(picture, labels, unused, *models, _CUT_ROUNDS, cv2.GC_INIT_WITH_MASK)
     return (labels & 1).astype(bool)
 
 

@@ -176,6 +176,7 @@ def is_behind_wrist(
     points: Float[np.ndarray, "*n 2"],
     rim: Float[np.ndarray, "rim 2"],
     hand: Float[np.ndarray, "2"],
+    margin: float = 0.0,
 ) -> Bool[np.ndarray, "*n"]:
     """Whether image points lie on the forearm's side of the line through the mesh's end.
 
@@ -183,9 +184,11 @@ def is_behind_wrist(
         points: pixels.
         rim: where the mesh ends, pixels.
         hand: centre of the hand, pixels; the line is perpendicular to the way there.
+        margin: pixels by which the line is moved towards the hand.
     """
     center = rim.mean(0)
-    return (points - center) @ (hand - center) < 0
+    towards = (hand - center) / (np.linalg.norm(hand - center) + 1e-9)
+    return (points - center) @ towards < margin
 
 
 def window_camera(

@@ -163,12 +163,10 @@ class HandTracer:
         path = {"type": "path", "max_depth": 5, "hide_emitters": True}
         self._path = self.mi.load_dict(path)
         self._maps = self.mi.load_dict(
-            {
-                "type": "aov",
-                "aovs": "albedo:albedo,place:position,normal:sh_normal",
-                "coverage": {"type": "path", "max_depth": 1, "hide_emitters": True},
-            }
+            {"type": "aov", "aovs": "albedo:albedo,place:position,normal:sh_normal"}
         )
+        # With one bounce less, scalar_rgb leaves the alpha of hidden emitters at zero.
+        self._coverage = self.mi.load_dict({**path, "max_depth": 2})
 
     def place(self, vertices: Float[Tensor, "vertices 3"], camera: Camera) -> None:
         """Moves the hand and the camera.
@@ -200,9 +198,10 @@ class HandTracer:
 
     def surface_maps(self, samples: int = 16) -> SurfaceMaps:
         """Albedo, depth and normals of what is seen."""
-        pixels = self._rendered(self._maps, samples, 0)
-        alpha, sums = pixels[..., 3:4], pixels[..., 4:]
-        # Misses count as zero in the averages: divide by the covered share of the pixel.
+        sums = self._rendered(self._maps, samples, 0)[..., -9:]
+        # Misses count as zero in the averages: divide by the covered share of the pixel. The same
+        # seed sends the same camera rays.
+        alpha = self._rendered(self._coverage, samples, 0)[..., 3:]
         albedo, places, normals = (sums / alpha.clamp(min=1e-6)).split(3, dim=-1)
         row = self._camera.camera_from_world[2]
         depth = (places @ row[:3] + row[3]) * (alpha[..., 0] > 0)

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image, ImageDraw
 from scipy import ndimage
 from torch import Tensor
@@ -34,8 +34,8 @@ from handavatar.capture.outlines import (
     silhouette,
     window_camera,
 )
-from handavatar.capture.tracking import TrackedHand, Track, resampled, track_hand
-from handavatar.geometry.cameras import Camera, project
+from handavatar.capture.tracking import Track, TrackedHand, resampled, track_hand
+from handavatar.geometry.cameras import project
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.rig import Rig
 
@@ -43,6 +43,8 @@ Progress = Callable[[float, str], None]
 """Told the share of the work that is done, in [0, 1], and what is being done."""
 
 _BOX_SCALE = 1.3
+_WRIST_BAND = 0.020
+_WRIST_SLACK = 0.004
 _HELD_OUT = ((0.28, 0.08), (0.68, 0.08))
 _MIN_KEPT = 8
 _SHEET_TILE = 192
@@ -79,7 +81,7 @@ class VideoOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class VideoFrameResult:
+class FittedFrame:
     """What became of one picture in which the hand was found.
 
     Attributes:
@@ -189,7 +191,7 @@ def observations_of(track: Track) -> Observations:
 
 def _fitted(
     track: Track, masks: list[HandMask], rig: Rig, options: VideoOptions, report: Progress
-) -> tuple[HandFit, list[VideoFrameResult]]:
+) -> tuple[HandFit, list[FittedFrame]]:
     report(0.65, "fitting the hand")
     observations = observations_of(track)
     outlines = [
@@ -220,28 +222,28 @@ def _result(
     vertices: Float[Tensor, "vertices 3"],
     error_metres: float,
     size: int,
-) -> VideoFrameResult:
+) -> FittedFrame:
     """One frame's crop, with its mask cut where the mesh ends."""
     window = hand.window
     side = window.image.shape[0]
-    whole = window_camera(
-        fit.focal, window.picture_size, window.corner, side / window.scale, side
-    )
-    cut = _cut_mask(mask.pixels, rig, vertices, whole)
-    corner, box = _box(cut)
-    image = resampled(window.image, np.eye(2) * (box / size), np.array(corner), size)
-    camera = whole.cropped(*corner, box, box).resized(size, size)
-    camera = Camera(
-        tuple(f * size / box for f in whole.focal),  # type: ignore[arg-type]
-        tuple((c - o) * size / box for c, o in zip(whole.center, corner, strict=True)),  # type: ignore[arg-type]
+    whole = window_camera(fit.focal, window.picture_size, window.corner, side / window.scale, side)
+    rim = rig.rim.numpy()
+    places = project(whole, vertices)[0].numpy()
+    corner, box = _box(_before_wrist(mask.pixels, places[rim], places.mean(0)))
+    camera = window_camera(
+        fit.focal,
+        window.picture_size,
+        (window.corner[0] + corner[0] / window.scale, window.corner[1] + corner[1] / window.scale),
+        box / window.scale,
         size,
-        size,
-        whole.camera_from_world,
     )
-    soft = (mask.pixels * np.uint8(255))[..., None].repeat(3, axis=-1)
-    full = resampled(soft, np.eye(2) * (box / size), np.array(corner), size)[..., 0] > 127
-    cut = _cut_mask(full, rig, vertices, camera)
+    zoom = np.eye(2) * (box / size)
+    image = resampled(window.image, zoom, np.array(corner), size)
+    grey = np.repeat(mask.pixels[..., None] * np.uint8(255), 3, axis=-1)
+    full = resampled(grey, zoom, np.array(corner), size)[..., 0] > 127
     mesh = silhouette(rig, vertices, camera)
+    scale = pixels_per_metre(hand) * window.scale * size / box
+    cut = _cut_mask(full, mesh, project(camera, vertices)[0].numpy(), rim, scale)
     iou = float((mesh & cut).sum() / max(1, int((mesh | cut).sum())))
     frame = Frame(
         name=f"{hand.index:06d}",
@@ -253,36 +255,59 @@ def _result(
         split="train",
         time=hand.time,
     )
-    crop_scale = pixels_per_metre(hand) * window.scale * size / box
-    return VideoFrameResult(frame, mesh, iou, error_metres * crop_scale)
+    return FittedFrame(frame, mesh, iou, error_metres * scale)
 
 
 def _confidence(hand: TrackedHand, mask: HandMask, iou: float, error_metres: float) -> float:
     """How far a pose is to be trusted: 1 if outline, landmarks and tracker all agree."""
     spread_metres = float(hand.spread.mean()) / pixels_per_metre(hand)
     outline = np.clip((iou - 0.65) / 0.25, 0, 1)
-    landmarks = np.exp(-((error_metres / 0.010) ** 2))
+    landmarks = np.exp(-((error_metres / 0.008) ** 2))
     agreement = np.exp(-((spread_metres / 0.015) ** 2))
     is_clear = np.clip((mask.quality - 0.5) / 0.35, 0, 1)
     presence = np.clip(hand.presence / 0.9, 0, 1)
     return float(outline * landmarks * agreement * is_clear * presence)
 
 
-def _cut_mask(
+def _before_wrist(
     mask: Bool[np.ndarray, "side side"],
-    rig: Rig,
-    vertices: Float[Tensor, "vertices 3"],
-    camera: Camera,
+    rim: Float[np.ndarray, "rim 2"],
+    hand: Float[np.ndarray, "2"],
+    margin: float = 0.0,
 ) -> Bool[np.ndarray, "side side"]:
-    """The mask without the forearm: nothing behind the wrist but what the mesh covers."""
-    places = project(camera, vertices)[0].numpy()
+    """The part of a mask in front of the wrist line, by at least ``margin`` pixels."""
     rows, columns = np.nonzero(mask)
     centers = np.stack([columns, rows], axis=-1) + 0.5
-    behind = is_behind_wrist(centers, places[rig.rim.numpy()], places.mean(0))
-    rows, columns = rows[behind], columns[behind]
-    cut = mask.copy()
-    cut[rows, columns] = silhouette(rig, vertices, camera)[rows, columns]
-    return cut
+    before = ~is_behind_wrist(centers, rim, hand, margin)
+    result = np.zeros_like(mask)
+    result[rows[before], columns[before]] = True
+    return result
+
+
+def _cut_mask(
+    mask: Bool[np.ndarray, "side side"],
+    mesh: Bool[np.ndarray, "side side"],
+    places: Float[np.ndarray, "vertices 2"],
+    rim: Int[np.ndarray, "rim"],
+    scale: float,
+) -> Bool[np.ndarray, "side side"]:
+    """The mask without the forearm.
+
+    Behind the wrist line only what the mesh covers stays, just before it only what is close to
+    the mesh: a forearm that leaves at an angle would leave a spur there.
+
+    Args:
+        mask: hand and forearm.
+        mesh: pixels that the fitted hand covers.
+        places: its vertices, pixels.
+        rim: those at its end.
+        scale: pixels per metre at the hand.
+    """
+    center = places.mean(0)
+    sure = _before_wrist(mask, places[rim], center, _WRIST_BAND * scale)
+    doubtful = _before_wrist(mask, places[rim], center) & ~sure
+    close = ndimage.distance_transform_edt(~mesh) < _WRIST_SLACK * scale
+    return sure | (doubtful & close) | (mask & mesh)
 
 
 def _box(mask: Bool[np.ndarray, "side side"]) -> tuple[tuple[float, float], float]:
@@ -310,7 +335,7 @@ def _with_split(frame: Frame, split: str) -> Frame:
     return Frame(**{**vars(frame), "split": split})
 
 
-def _summary(results: list[VideoFrameResult], fit: HandFit) -> dict[str, object]:
+def _summary(results: list[FittedFrame], fit: HandFit) -> dict[str, object]:
     return {
         "focal_pixels": fit.focal,
         "mean_mask_iou": float(np.mean([result.mask_iou for result in results])),
@@ -330,7 +355,7 @@ def _save_json(path: Path, content: object) -> None:
     path.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
 
 
-def _overview(results: list[VideoFrameResult], skipped: set[str]) -> Image.Image:
+def _overview(results: list[FittedFrame], skipped: set[str]) -> Image.Image:
     """Contact sheet: mask outline green, mesh outline red, what was left out framed in red."""
     step = max(1, -(-len(results) // _SHEET_FRAMES))
     shown = results[::step]
@@ -348,7 +373,7 @@ def _overview(results: list[VideoFrameResult], skipped: set[str]) -> Image.Image
     return sheet
 
 
-def _drawn_outlines(result: VideoFrameResult) -> UInt8[np.ndarray, "height width 3"]:
+def _drawn_outlines(result: FittedFrame) -> UInt8[np.ndarray, "height width 3"]:
     image = result.frame.image.numpy().copy()
     mask = result.frame.mask.numpy()
     image[mask ^ ndimage.binary_erosion(mask)] = (0, 255, 0)

@@ -10,9 +10,13 @@ def video(words: list[str]) -> int:
     """A video of one bare hand -> capture: track, mask, fit pose and shape."""
     from handavatar.capture.video import VideoOptions, capture_video
     from handavatar.cli.arguments import parse
+    from handavatar.train.progress import Progress
 
     options = parse(VideoOptions, words, "capture video", positional=("file",))
-    capture_video(options)
+    with Progress("capture video", 100) as progress:
+        capture_video(
+            options, progress=lambda share, stage: progress.update(round(100 * share), stage)
+        )
     print(f"capture: {options.out}\nnext: handavatar train {options.out}")
     return 0
 

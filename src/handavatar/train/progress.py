@@ -52,6 +52,7 @@ class Progress:
         self._clock = clock
         self._marks: deque[tuple[float, int]] = deque([(clock(), done)])
         self._figures: dict[str, float] = {}
+        self._note = ""
         self._last_line = clock()
         self._live: Live | None = None
 
@@ -76,15 +77,16 @@ class Progress:
         else:
             self._write_line()
 
-    def update(self, step: int, **figures: float) -> None:
+    def update(self, step: int, note: str = "", /, **figures: float) -> None:
         """Says that ``step`` steps are done.
 
         Args:
             step: steps done, counted from the beginning of the whole job.
+            note: what is being done now, if the job has several stages.
             figures: latest values to show, such as ``psnr`` in decibels; others stay as they were.
         """
         now = self._clock()
-        self._step = step
+        self._step, self._note = step, note
         self._figures.update(figures)
         self._marks.append((now, step))
         while len(self._marks) > 2 and self._marks[0][0] < now - _SPEED_WINDOW:
@@ -111,6 +113,7 @@ class Progress:
         parts = [f"{self._job} {self._step}/{self._total}", f"{self.steps_per_second:.1f} steps/s"]
         parts += [_figure(name, value) for name, value in self._figures.items()]
         parts.append(f"{duration(self.seconds_left)} left")
+        parts += [self._note] if self._note else []
         return Text("   ".join(parts), no_wrap=True, overflow="ellipsis")
 
     def _write_line(self) -> None:
@@ -121,6 +124,8 @@ class Progress:
             "steps_per_second": round(self.steps_per_second, 3),
             "seconds_left": round(self.seconds_left) if math.isfinite(self.seconds_left) else None,
         }
+        if self._note:
+            record["note"] = self._note
         for name, value in self._figures.items():
             record[name] = round(value, 4) if math.isfinite(value) else None
         print(json.dumps(record), file=self._stream, flush=True)
