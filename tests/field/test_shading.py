@@ -51,7 +51,7 @@ def test_albedo_and_illumination_are_in_range_and_of_the_papers_sizes() -> None:
     illumination = IlluminationField(torch.rand(50, 3))
     color = albedo(_neighbours())
     light = illumination(torch.zeros(NUM_BONES, 3), _neighbours(), torch.rand(6, NUM_BONES))
-    for value in (color, light):
+    for value in (color.detach(), light.detach()):
         assert 0 <= float(value.min()) <= float(value.max()) <= 1
     assert color.shape == (6, 3) and light.shape == (6,)
     # Paper appendix, the table of MLPs: 128 -> 4 x 256 -> 3 and 85 -> 4 x 256 -> 1.

@@ -3,7 +3,13 @@
 import torch
 
 from handavatar.field.layers import positional_encoding
-from handavatar.field.shape import HAND_SCALE, NUM_FREQUENCIES, ShapeOffsets, personal_hand
+from handavatar.field.shape import (
+    HAND_SCALE,
+    NUM_FREQUENCIES,
+    OFFSET_SCALE,
+    ShapeOffsets,
+    personal_hand,
+)
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import NUM_BONES
 
@@ -34,7 +40,8 @@ def test_the_pose_as_a_bias_equals_the_pose_as_an_input() -> None:
     pose = rotations[1:].flatten().expand(len(encoded), -1)
     inputs = torch.cat([encoded, pose], dim=-1)
     assert inputs.shape[-1] == 84
-    torch.testing.assert_close(field(rest, rotations), field.mlp(inputs), atol=1e-6, rtol=1e-4)
+    expected = OFFSET_SCALE * field.mlp(inputs)
+    torch.testing.assert_close(field(rest, rotations), expected, atol=1e-6, rtol=1e-4)
 
 
 def test_the_wrist_stays_whatever_the_offsets() -> None:

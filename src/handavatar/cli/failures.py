@@ -41,7 +41,7 @@ def explanation(error: BaseException) -> tuple[int, str]:
     """Exit code and text of an error."""
     text = str(error).strip() or type(error).__name__
     if isinstance(error, KeyboardInterrupt):
-        return INTERRUPTED, "interrupted"
+        return INTERRUPTED, f"interrupted: {error}" if str(error) else "interrupted"
     if isinstance(error, ModuleNotFoundError):
         package = (error.name or "").split(".")[0]
         if package in _EXTRAS:
@@ -67,4 +67,7 @@ def explanation(error: BaseException) -> tuple[int, str]:
     # RigError, CaptureError, CheckpointError: the kinds that a user's file can cause.
     if isinstance(error, ValueError) and type(error).__module__.startswith("handavatar."):
         return BAD_DATA, text
+    # The library names the option that it cannot honour, such as --device cuda without a GPU.
+    if isinstance(error, ValueError) and text.startswith("--"):
+        return USAGE, text
     return OUR_BUG, f"{type(error).__name__}: {text}"

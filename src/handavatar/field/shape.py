@@ -11,6 +11,8 @@ from handavatar.hand.rig import ShapedHand
 HAND_SCALE = 0.1
 """Rest positions are divided by this (metres) before they are encoded."""
 NUM_FREQUENCIES = 6
+OFFSET_SCALE = 0.01
+"""The network's output is multiplied by this (metres), so that its weights are of order one."""
 
 
 class ShapeOffsets(nn.Module):
@@ -26,7 +28,7 @@ class ShapeOffsets(nn.Module):
         """Starts at zero offsets."""
         super().__init__()
         self.mlp = MLP(3 + 6 * NUM_FREQUENCIES + 3 * (NUM_BONES - 1), 128, 4, 3)
-        nn.init.normal_(self.mlp.output.weight, std=1e-4)
+        nn.init.normal_(self.mlp.output.weight, std=1e-3)
         nn.init.zeros_(self.mlp.output.bias)
 
     def forward(
@@ -49,7 +51,7 @@ class ShapeOffsets(nn.Module):
         values = torch.addmm(bias, encoded, first.weight[:, :width].T).relu()
         for layer in list(self.mlp.hidden)[1:]:
             values = layer(values).relu()
-        return self.mlp.output(values)
+        return OFFSET_SCALE * self.mlp.output(values)
 
 
 def personal_hand(rest: ShapedHand, offsets: Float[Tensor, "vertices 3"]) -> ShapedHand:

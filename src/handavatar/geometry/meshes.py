@@ -144,7 +144,7 @@ def sample_surface(
         ValueError: if the faces have no area.
     """
     area = face_cross_products(vertices, faces).norm(dim=-1)
-    if not float(area.sum()) > 0:
+    if not float(area.detach().sum()) > 0:
         raise ValueError(f"cannot sample {count} points on {len(faces)} faces without area")
     chosen = torch.multinomial(area.double(), count, replacement=True, generator=generator)
     u = torch.rand(count, 2, generator=generator, dtype=vertices.dtype)
@@ -158,7 +158,7 @@ def sample_surface_evenly(
     faces: Int[Tensor, "faces 3"],
     count: int,
     generator: torch.Generator,
-    oversampling: int = 8,
+    oversampling: int = 4,
 ) -> SurfacePoints:
     """Blue-noise samples: the farthest points among ``oversampling * count`` random ones.
 
@@ -167,13 +167,16 @@ def sample_surface_evenly(
     """
     candidates = sample_surface(vertices, faces, oversampling * count, generator)
     positions = candidates.positions(vertices)
+    positions = positions - positions.mean(0)
+    squares = positions.square().sum(-1)
     chosen = torch.empty(count, dtype=torch.long)
     chosen[0] = 0
-    nearest = (positions - positions[0]).square().sum(-1)
+    nearest = torch.full_like(squares, torch.inf)
     for index in range(1, count):
+        last = chosen[index - 1]
+        offset = torch.addmv(squares, positions, positions[last], alpha=-2) + squares[last]
+        torch.minimum(nearest, offset, out=nearest)
         chosen[index] = nearest.argmax()
-        offset = (positions - positions[chosen[index]]).square().sum(-1)
-        nearest = torch.minimum(nearest, offset)
     return SurfacePoints(candidates.faces[chosen], candidates.barycentric[chosen])
 
 

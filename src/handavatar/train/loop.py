@@ -55,7 +55,8 @@ class Method:
         patch_size: pixels along a side.
         num_samples: samples per ray while training.
         silhouette_size: the mask is compared at this many pixels along a side.
-        lr: learning rate of shape, albedo and illumination at the start.
+        lr: learning rate of albedo and illumination at the start.
+        lr_shape: learning rate of the shape offsets at the start.
         lr_codes: learning rate of the albedo codes at the start.
         lr_decoder: learning rate of the pair decoder at the start.
         lr_pose: learning rate of the pose corrections at the start.
@@ -71,6 +72,7 @@ class Method:
     num_samples: int
     silhouette_size: int
     lr: float = 5e-4
+    lr_shape: float = 5e-4
     lr_codes: float = 5e-4
     lr_decoder: float = 5e-5
     lr_pose: float = 1e-3
@@ -244,13 +246,10 @@ def begin_training(
     avatar.moved_to(device)
     groups: list[dict[str, Any]] = [
         {
-            "params": [
-                *avatar.shape.parameters(),
-                *avatar.albedo.mlp.parameters(),
-                *avatar.illumination.parameters(),
-            ],
+            "params": [*avatar.albedo.mlp.parameters(), *avatar.illumination.parameters()],
             "lr": method.lr,
         },
+        {"params": list(avatar.shape.parameters()), "lr": method.lr_shape},
         {"params": [avatar.albedo.codes], "lr": method.lr_codes},
         {"params": list(avatar.occupancy.decoder.parameters()), "lr": method.lr_decoder},
     ]

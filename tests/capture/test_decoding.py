@@ -1,0 +1,94 @@
+"""What is read from a video file, and what is refused."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from videos import grey_levels, save_sound, save_video
+
+from handavatar.capture.checks import CaptureError
+from handavatar.capture.decoding import video_frames
+
+
+def test_every_third_picture_of_thirty_per_second(tmp_path: Path) -> None:
+    path = save_video(tmp_path / "a.mp4", grey_levels(30))
+    frames = list(video_frames(path, fps=10))
+    assert [frame.index for frame in frames] == list(range(0, 30, 3))
+    assert np.allclose([frame.time for frame in frames], np.arange(10) / 10, atol=1e-3)
+    levels = [float(frame.image[90:, :, 2].mean()) for frame in frames]
+    # Limited-range YUV and compression move a grey by a few steps.
+    assert np.allclose(levels, [4 * frame.index for frame in frames], atol=6)
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.mov", "a.mkv"])
+def test_common_containers_open(tmp_path: Path, name: str) -> None:
+    path = save_video(tmp_path / name, grey_levels(6))
+    assert len(list(video_frames(path, fps=30))) == 6
+
+
+def test_stops_at_the_greatest_number_of_pictures(tmp_path: Path) -> None:
+    path = save_video(tmp_path / "a.mp4", grey_levels(20))
+    assert len(list(video_frames(path, fps=30, max_frames=4))) == 4
+
+
+def test_large_pictures_are_brought_down(tmp_path: Path) -> None:
+    path = save_video(tmp_path / "a.mp4", grey_levels(2, size=(2400, 1200)))
+    assert next(video_frames(path)).image.shape == (960, 1920, 3)
+
+
+def test_the_phone_s_rotation_is_undone(tmp_path: Path) -> None:
+    path = save_video(tmp_path / "a.mp4", grey_levels(6))
+    content = bytearray(path.read_bytes())
+    # tkhd version 0: size, type, version and flags, 36 bytes of times, ids and layers, the matrix.
+    matrix = content.index(b"tkhd") + 4 + 4 + 36
+    # A phone held upright: the player turns the picture clockwise by a quarter.
+    quarter = (0, 1 << 16, 0, -1 << 16, 0, 0, 120 << 16, 0, 1 << 30)
+    content[matrix : matrix + 36] = struct.pack(">9i", *quarter)
+    path.write_bytes(content)
+    image = next(video_frames(path)).image
+    assert image.shape == (160, 120, 3)
+    # The red upper half of the stored picture ends up on the right.
+    assert image[:, 70:, 0].min() > 200
+    assert image[:, :50, 0].max() < 60
+
+
+def _refusal(path: Path) -> str:
+    with pytest.raises(CaptureError) as caught:
+        list(video_frames(path))
+    assert caught.value.remedy
+    return str(caught.value)
+
+
+def test_refuses_what_is_no_video(tmp_path: Path) -> None:
+    assert "no such file" in _refusal(tmp_path / "none.mp4")
+    empty = tmp_path / "empty.mp4"
+    empty.touch()
+    assert "empty" in _refusal(empty)
+    text = tmp_path / "text.mp4"
+    text.write_text("this is a letter, not a video\n" * 100)
+    assert "not a video" in _refusal(text)
+    assert "no pictures, only audio" in _refusal(save_sound(tmp_path / "sound.mp4"))
+    small = save_video(tmp_path / "small.mp4", grey_levels(3, size=(64, 48)))
+    assert "64 x 48" in _refusal(small)
+
+
+def test_refuses_playlists_and_other_containers(tmp_path: Path) -> None:
+    good = save_video(tmp_path / "good.mp4", grey_levels(3))
+    playlist = tmp_path / "list.mp4"
+    playlist.write_text(f"#EXTM3U\n#EXTINF:1,\n{good}\n#EXT-X-ENDLIST\n")
+    assert "not a video" in _refusal(playlist)
+    assert "not a video" in _refusal(save_video(tmp_path / "a.avi", grey_levels(3)))
+
+
+def test_refuses_files_cut_short(tmp_path: Path) -> None:
+    generator = np.random.default_rng(0)
+    noise = [generator.integers(0, 256, (120, 160, 3), dtype=np.uint8) for _ in range(60)]
+    content = save_video(tmp_path / "whole.mp4", noise).read_bytes()
+    without_index = tmp_path / "half.mp4"
+    without_index.write_bytes(content[: len(content) // 2])
+    assert "not a video" in _refusal(without_index)
+    whole = save_video(tmp_path / "whole.mkv", noise).read_bytes()
+    half = tmp_path / "half.mkv"
+    half.write_bytes(whole[: len(whole) // 2])
+    assert "breaks off" in _refusal(half)

@@ -1,0 +1,190 @@
+"""Known poses come back from what a camera would see of them."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from handavatar.capture.fitting import (
+    FitOptions,
+    HandFit,
+    HandModel,
+    Observations,
+    fit_hands,
+    initial_fit,
+    landmark_errors,
+    placed,
+    projected,
+    refined,
+)
+from handavatar.capture.outlines import (
+    OutlineMatcher,
+    is_behind_wrist,
+    mask_outline,
+    silhouette,
+    window_camera,
+)
+from handavatar.capture.tracking import LANDMARK_NAMES, Window
+from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from handavatar.hand.open_hand import load_open_hand
+from handavatar.hand.pose import HandPose
+from handavatar.hand.pose_sampling import gesture_rotations, interpolate_rotations
+from handavatar.hand.rig import Rig
+
+PICTURE = (1280, 720)
+FOCAL = 1280.0
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_open_hand("778")
+
+
+@pytest.fixture(scope="module")
+def truth(rig: Rig) -> HandFit:
+    """A hand that goes from spread to pinch, palm to the camera, fingers up, slightly turning."""
+    keys = torch.stack([gesture_rotations(rig, name) for name in ("spread", "relaxed", "pinch")])
+    rotations = interpolate_rotations(keys, torch.linspace(0, 2, FRAMES))
+    # Rest axes are fingers -x, back +y, thumb +z; the camera looks along +z with y downwards.
+    upright = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    for frame in range(FRAMES):
+        turn = matrix_from_axis_angle(torch.tensor([0.1, 0.15 * (frame - 2), 0.05 * frame]))
+        rotations[frame, 0] = axis_angle_from_matrix(turn @ upright)
+    steps = torch.arange(FRAMES)[:, None] * torch.tensor([0.004, 0.002, 0.003])
+    shape = torch.zeros(rig.shape_directions.shape[-1])
+    shape[0] = 0.7
+    return HandFit(
+        rotations,
+        torch.tensor([0.02, 0.09, 0.7]) + steps,
+        shape,
+        torch.tensor(math.log(FOCAL)),
+        torch.zeros(21, 3),
+    )
+
+
+def _seen(rig: Rig, truth: HandFit) -> Observations:
+    model = HandModel(rig)
+    points = model.landmarks(truth)
+    return Observations(
+        landmarks=projected(points, truth.log_focal.exp(), PICTURE),
+        uncertainty=torch.full((len(points), 21), 0.5),
+        world_landmarks=points - points.mean(1, keepdim=True),
+        scale=FOCAL / points[..., 2].mean(1),
+        times=torch.arange(len(points)) / 10,
+        picture_size=PICTURE,
+    )
+
+
+def _relative(points: Float[Tensor, "frames 21 3"]) -> Float[Tensor, "frames 21 3"]:
+    return points - points[:, :1]
+
+
+def test_landmarks_are_joints_and_fingertips_in_the_tracker_s_order(
+    rig: Rig, truth: HandFit
+) -> None:
+    points = HandModel(rig).landmarks(truth)
+    pose = HandPose(truth.rotations, truth.translation)
+    hand = rig.shaped(truth.shape_coefficients).posed(pose)
+    by_name = dict(zip(LANDMARK_NAMES, points.unbind(1), strict=True))
+    assert torch.allclose(by_name["wrist"], hand.joints[:, 0], atol=1e-5)
+    assert torch.allclose(by_name["little_pip"], hand.joints[:, 8], atol=1e-5)
+    assert torch.allclose(by_name["thumb_ip"], hand.joints[:, 15], atol=1e-5)
+    tips = hand.vertices[:, rig.vertex_sets["fingertips"]]
+    # A tip is taken to move with its last bone alone; its vertex may lean on the one before.
+    for number, finger in enumerate(("thumb", "index", "middle", "ring", "little")):
+        assert (by_name[f"{finger}_tip"] - tips[:, number]).norm(dim=-1).max() < 5e-4
+
+
+def test_single_vertices_equal_the_rig_s(rig: Rig, truth: HandFit) -> None:
+    model = HandModel(rig)
+    chosen = torch.randint(0, rig.num_vertices, (FRAMES, 50), generator=torch.manual_seed(0))
+    pose = HandPose(truth.rotations, truth.translation)
+    expected = rig.shaped(truth.shape_coefficients).posed(pose).vertices
+    picked = expected.gather(1, chosen[..., None].expand(-1, -1, 3))
+    assert torch.allclose(model.vertices(truth, chosen), picked, atol=1e-5)
+    assert torch.allclose(model.all_vertices(truth), expected, atol=1e-5)
+
+
+def test_placing_is_exact_for_a_known_pose(rig: Rig, truth: HandFit) -> None:
+    model, seen = HandModel(rig), _seen(rig, truth)
+    away = HandFit(**{**vars(truth), "translation": torch.zeros(FRAMES, 3)})
+    assert torch.allclose(placed(model, seen, away).translation, truth.translation, atol=1e-4)
+
+
+def test_known_poses_come_back_from_their_landmarks(rig: Rig, truth: HandFit) -> None:
+    model, seen = HandModel(rig), _seen(rig, truth)
+    fit = fit_hands(rig, seen, FitOptions(landmark_steps=200))
+    # The tracker's own noise is several pixels; the fit must add little to it.
+    assert landmark_errors(model, seen, fit).max() < 2.0
+    # One camera cannot tell a large hand from a near one: only the ratio is determined.
+    found, true = _relative(model.landmarks(fit)), _relative(model.landmarks(truth))
+    size = found.norm(dim=-1).mean() / true.norm(dim=-1).mean()
+    assert 0.9 < size < 1.1
+    assert (found / size - true).norm(dim=-1).median() < 0.005
+    ratio = fit.focal / fit.translation[:, 2] * truth.translation[:, 2] / truth.focal
+    assert torch.allclose(size * ratio, torch.ones(FRAMES), atol=0.05)
+
+
+def test_outlines_draw_the_mesh_onto_the_mask(rig: Rig, truth: HandFit) -> None:
+    model, seen = HandModel(rig), _seen(rig, truth)
+    vertices = model.all_vertices(truth)
+    outlines = []
+    for frame in range(FRAMES):
+        low = seen.landmarks[frame].amin(0) - 60
+        side = float((seen.landmarks[frame].amax(0) + 60 - low).max())
+        corner = (float(low[0]), float(low[1]))
+        camera = window_camera(FOCAL, PICTURE, corner, side, 256)
+        mask = silhouette(rig, vertices[frame], camera)
+        window = Window(np.zeros((256, 256, 3), dtype=np.uint8), corner, 256 / side, PICTURE)
+        outlines.append(mask_outline(mask, window, float(seen.scale[frame])))
+    matcher = OutlineMatcher(rig, outlines, PICTURE)
+
+    # Landmarks of a tracker that errs by 8 pixels, towards the same side in all frames.
+    noise = 8 * torch.randn(1, 21, 2, generator=torch.manual_seed(1))
+    landmarks = seen.landmarks + noise
+    unsure = torch.full((FRAMES, 21), 8.0)
+    wrong = Observations(**{**vars(seen), "landmarks": landmarks, "uncertainty": unsure})
+    options = FitOptions()
+    start = refined(model, wrong, initial_fit(model, wrong, options), options, steps=60)
+    fit = refined(model, wrong, start, options, steps=60, find_pairs=matcher)
+
+    def overlap(tried: HandFit) -> float:
+        shares = []
+        for outline, hand in zip(outlines, model.all_vertices(tried), strict=True):
+            window = outline.window
+            camera = window_camera(tried.focal, PICTURE, window.corner, 256 / window.scale, 256)
+            mesh = silhouette(rig, hand, camera)
+            shares.append((mesh & outline.mask).sum() / (mesh | outline.mask).sum())
+        return float(np.mean(shares))
+
+    assert overlap(fit) > 0.94 > overlap(start)
+
+
+def test_the_outline_of_a_disc_points_outwards() -> None:
+    y, x = np.mgrid[:100, :100] + 0.5
+    mask = (x - 40) ** 2 + (y - 55) ** 2 < 30**2
+    window = Window(np.zeros((100, 100, 3), dtype=np.uint8), (200.0, 100.0), 0.5, (2000, 2000))
+    outline = mask_outline(mask, window, 1000.0)
+    center = np.array([200 + 40 / 0.5, 100 + 55 / 0.5])
+    apart = outline.points - center
+    radius = np.linalg.norm(apart, axis=-1)
+    # Twice the window's pixels; the border is known to a pixel of the window.
+    assert np.abs(radius - 60).max() < 2.0
+    assert ((apart / radius[:, None]) * outline.normals).sum(-1).min() > 0.97
+    assert outline.covers(np.array([center, center + [70, 0], [-5.0, 10.0]])).tolist() == [
+        True,
+        False,
+        True,
+    ]
+
+
+def test_the_wrist_line_separates_hand_and_forearm() -> None:
+    rim = np.array([[40.0, 100.0], [60.0, 100.0]])
+    hand = np.array([50.0, 40.0])
+    points = np.array([[50.0, 20.0], [50.0, 95.0], [90.0, 101.0]])
+    assert is_behind_wrist(points, rim, hand).tolist() == [False, False, True]
+    assert is_behind_wrist(points, rim, hand, margin=10.0).tolist() == [False, True, True]

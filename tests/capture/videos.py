@@ -1,0 +1,54 @@
+"""Small video files for tests, and the way to the real one."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+
+REAL_VIDEO = Path(__file__).parents[3] / "shared/data/real_hand/human_hand_video.mp4"
+
+needs_real_video = pytest.mark.skipif(
+    not REAL_VIDEO.is_file(), reason=f"{REAL_VIDEO} is only in the development folder"
+)
+
+
+def save_video(
+    path: Path, images: Iterable[np.ndarray], fps: int = 30, codec: str = "mpeg4"
+) -> Path:
+    """Writes pictures as a video; the container follows from the name."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=fps)
+        stream.bit_rate = 8_000_000
+        for number, image in enumerate(images):
+            if number == 0:
+                stream.height, stream.width = image.shape[:2]
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def save_sound(path: Path) -> Path:
+    """Writes half a second of silence."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("aac", rate=16000, layout="mono")
+        for start in range(0, 8000, 1000):
+            frame = av.AudioFrame.from_ndarray(
+                np.zeros((1, 1000), dtype=np.float32), format="fltp", layout="mono"
+            )
+            frame.sample_rate, frame.pts = 16000, start
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    return path
+
+
+def grey_levels(count: int, size: tuple[int, int] = (160, 120)) -> list[np.ndarray]:
+    """Pictures that grow brighter by 4 of 255 each, upper half red."""
+    images = []
+    for number in range(count):
+        image = np.full((size[1], size[0], 3), 4 * number, dtype=np.uint8)
+        image[: size[1] // 2, :, 0] = 255
+        images.append(image)
+    return images

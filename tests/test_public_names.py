@@ -1,0 +1,77 @@
+"""The names that users' programs may rely on. A change here is a change for them: say so.
+
+The modules of the first table are the library: exactly these names are public in them. Of the
+modules in the second, only these names are promised; the rest may change.
+"""
+
+import ast
+
+import pytest
+from source_tree import find_definition, modules
+
+EXACTLY = {
+    "geometry.cameras": "Camera Rays look_at pixel_centers project rays_through_pixels",
+    "geometry.rotations": (
+        "apply_rigid axis_angle_from_matrix invert_rigid matrix_from_axis_angle "
+        "quaternion_from_matrix rigid_transform skew"
+    ),
+    "hand.pose": (
+        "BONE_NAMES BONE_PARENTS CONNECTED_PAIRS FINGER_BONES HandPose NUM_BONES "
+        "bone_transforms linear_blend_skinning"
+    ),
+    "hand.rig": "PosedHand Rig RigError ShapedHand",
+    "hand.open_hand": "Level load_open_hand",
+    "hand.detail": "subdivided",
+    "edit": "Edit bones_named",
+    "avatar": "CheckpointError HandAvatar HandState RayValues RenderSettings Rendering SCHEMA",
+    "capture.default": "default_capture",
+}
+AT_LEAST = {
+    "avatar": "HandAvatar.load HandAvatar.render HandAvatar.save",
+    "hand.pose": "HandPose.flat",
+    "hand.rig": "Rig.shaped ShapedHand.posed",
+    "capture.frames": (
+        "Capture Capture.frame Capture.split Frame CaptureWriter find_problems read_capture "
+        "write_capture"
+    ),
+    "capture.checks": "CaptureError",
+    "capture.video": "VideoOptions capture_video",
+    "capture.synthetic": "SynthOptions make_capture",
+    "train.loop": "TrainOptions train",
+    "train.prior": "PriorOptions train_prior PriorEvaluationOptions evaluate_prior",
+    "evaluate.run": "EvaluateOptions evaluate_run",
+    "doctor": "Finding examine",
+    "cli": "main",
+}
+TREES = modules()
+
+
+def _public_names(tree: ast.Module) -> set[str]:
+    """Classes, functions and values defined at the top of a module; imported names are not."""
+    names = set()
+    for node in tree.body:
+        if isinstance(node, ast.ClassDef | ast.FunctionDef):
+            names.add(node.name)
+        elif isinstance(node, ast.Assign):
+            names |= {target.id for target in node.targets if isinstance(target, ast.Name)}
+        elif isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+            names.add(node.target.id)
+    return {name for name in names if not name.startswith("_")}
+
+
+@pytest.mark.parametrize("module", EXACTLY)
+def test_the_library_has_exactly_these_names(module: str) -> None:
+    assert _public_names(TREES[f"handavatar.{module}"]) == set(EXACTLY[module].split())
+
+
+@pytest.mark.parametrize("module", AT_LEAST)
+def test_these_names_are_promised(module: str) -> None:
+    tree = TREES[f"handavatar.{module}"]
+    missing = [n for n in AT_LEAST[module].split() if find_definition(tree, n) is None]
+    assert not missing
+
+
+def test_the_package_says_its_version() -> None:
+    assert _public_names(TREES["handavatar"]) == set()
+    source = ast.unparse(TREES["handavatar"])
+    assert "__version__ = " in source
