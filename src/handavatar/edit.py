@@ -56,7 +56,7 @@ def bones_named(names: tuple[str, ...]) -> tuple[int, ...]:
             bones.append(BONE_NAMES.index(name))
         else:
             raise ValueError(
-                f"'{name}' is neither a finger nor a bone; choose from "
+                f"--lift-shadow: '{name}' is neither a finger nor a bone; choose from "
                 f"{', '.join([*FINGER_BONES, *BONE_NAMES])}"
             )
     return tuple(dict.fromkeys(bones))

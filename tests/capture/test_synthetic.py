@@ -1,3 +1,4 @@
+import dataclasses
 import json
 
 import numpy as np
@@ -7,7 +8,7 @@ from PIL import Image, ImageDraw
 from safetensors.torch import load_file
 
 from handavatar.capture.default import default_capture
-from handavatar.capture.frames import find_problems
+from handavatar.capture.frames import CaptureError, find_problems
 from handavatar.capture.pathtracer import linear_from_srgb, srgb_from_linear
 from handavatar.capture.synthetic import (
     SynthOptions,
@@ -120,6 +121,19 @@ def test_depth_and_normals_are_those_of_the_hand(capture):
     assert ((normals @ rotation.T)[:, 2] < 0.1).mean() > 0.95
 
 
+@pytest.mark.parametrize("options", [{"train_frames": 0}, {"size": 2}, {"tone": 1.5}])
+def test_options_that_cannot_be_rendered_are_refused(options):
+    with pytest.raises(CaptureError, match=next(iter(options))):
+        SynthOptions(**options)
+
+
+def test_a_folder_in_use_is_refused_before_the_work(tmp_path):
+    pytest.importorskip("mitsuba")
+    (tmp_path / "letter.txt").write_text("dear")
+    with pytest.raises(CaptureError, match="not empty"):
+        make_capture(tmp_path, TINY)
+
+
 def test_the_crop_leaves_the_margin_it_says():
     vertices = load_open_hand().template_vertices
     camera = crop_camera(vertices, 100)
@@ -154,6 +168,8 @@ def test_training_sees_all_sides_and_testing_other_poses():
 
 def test_the_shipped_capture_is_whole():
     capture = default_capture()
+    facts = json.loads((capture.folder / "truth/truth.json").read_text())
+    assert facts["options"] == dataclasses.asdict(SynthOptions())
     assert len(capture.split("train")) == 80
     assert len(capture.split("test")) == 20
     assert capture.rig_sha256 == load_open_hand().sha256

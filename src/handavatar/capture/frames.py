@@ -171,6 +171,11 @@ class Capture:
             raise CaptureError(f"there is no split {name!r}", f"ask for one of {', '.join(SPLITS)}")
         return tuple(i for i, record in enumerate(self.records) if record.split == name)
 
+    @property
+    def is_tracked(self) -> bool:
+        """Whether any pose is an estimate and not known: its confidence is below one."""
+        return any(record.confidence < 1 for record in self.records)
+
     @cached_property
     def sha256(self) -> str:
         """Fingerprint of ``transforms.json``."""

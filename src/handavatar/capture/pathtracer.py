@@ -97,7 +97,10 @@ def choose_variant(wanted: Variant = "auto") -> str:
     if wanted != "auto":
         return wanted
     trial = "import mitsuba as m, drjit as d; m.set_variant('llvm_ad_rgb'); d.eval(m.Float(1) + 1)"
-    done = subprocess.run([sys.executable, "-c", trial], capture_output=True, timeout=120)
+    try:
+        done = subprocess.run([sys.executable, "-c", trial], capture_output=True, timeout=120)
+    except (OSError, subprocess.TimeoutExpired):
+        return "scalar_rgb"
     return "llvm_ad_rgb" if done.returncode == 0 else "scalar_rgb"
 
 

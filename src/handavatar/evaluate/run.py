@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from handavatar.alignment import aligned_pose
 from handavatar.avatar import CheckpointError, HandAvatar, Rendering
 from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
-from handavatar.evaluate.alignment import aligned_pose
 from handavatar.evaluate.metrics import (
     JudgedFrame,
     albedo_psnr,
@@ -74,11 +74,13 @@ def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
             f"{capture.folder}: no frame of split {options.split!r}",
             "name another split with --split",
         )
-    is_tracked = capture.source.startswith("video")
+    is_tracked = capture.is_tracked
     frames = [capture.frame(index) for index in indices]
     renderings, judged = [], []
     for frame in frames:
-        pose = aligned_pose(avatar, frame) if is_tracked else frame.pose
+        pose = frame.pose
+        if is_tracked:
+            pose = aligned_pose(avatar, pose, frame.camera, frame.mask)
         rendering = _on_cpu(avatar.render(pose, frame.camera))
         renderings.append(rendering)
         judged.append(

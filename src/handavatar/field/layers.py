@@ -29,6 +29,14 @@ def positional_encoding(
     return torch.cat([positions, phases.sin(), phases.cos()], dim=-1)
 
 
+def _relu_layer(width_in: int, width_out: int) -> nn.Linear:
+    """A layer whose ReLU outputs keep the variance of its inputs."""
+    layer = nn.Linear(width_in, width_out)
+    nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
 class MLP(nn.Module):
     """Fully connected layers with ReLU between them; depth counts the hidden layers.
 
@@ -40,11 +48,8 @@ class MLP(nn.Module):
         """Widths in units; ``depth`` hidden layers (paper appendix, table of MLPs)."""
         super().__init__()
         widths = [width_in] + [width] * depth
-        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
+        self.hidden = nn.ModuleList(_relu_layer(a, b) for a, b in pairwise(widths))
         self.output = nn.Linear(width, width_out)
-        for layer in self.hidden:
-            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
-            nn.init.zeros_(layer.bias)
 
     def forward(self, inputs: Float[Tensor, "*batch width_in"]) -> Float[Tensor, "*batch width"]:
         """Applies the layers to the last axis."""
@@ -64,16 +69,13 @@ class SkipMLP(nn.Module):
         super().__init__()
         self.layers = nn.ModuleList(
             [
-                nn.Linear(width_in, width),
-                nn.Linear(width, width - width_in),
-                nn.Linear(width, width),
-                nn.Linear(width, width),
+                _relu_layer(width_in, width),
+                _relu_layer(width, width - width_in),
+                _relu_layer(width, width),
+                _relu_layer(width, width),
             ]
         )
         self.output = nn.Linear(width, width_out)
-        for layer in self.layers:
-            nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
-            nn.init.zeros_(layer.bias)
 
     def forward(self, inputs: Float[Tensor, "*batch width_in"]) -> Float[Tensor, "*batch width"]:
         """Applies the layers to the last axis."""

@@ -10,6 +10,7 @@ hold the point, shares first layers between pairs, and is fast.
 """
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -66,24 +67,15 @@ class Occupancy:
     items: PairItems
 
 
-def occupancy_from_logits(logits: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Sigmoid; minus infinity (no box holds the point) gives zero.
-
-    Source: paper Sec. 3.2, Eq. 1 (sigma).
-    """
-    return torch.sigmoid(logits)
-
-
-def soft_occupancy(
-    logits: Float[Tensor, "*batch"], softness: float = 0.05
-) -> Float[Tensor, "*batch"]:
-    """Sigmoid with a gentle slope, so that near and far outside differ.
+def soft_occupancy(logits: Float[Tensor, "*batch"], softness: float) -> Float[Tensor, "*batch"]:
+    """Sigmoid of ``softness`` times the logits.
 
     Args:
-        logits: part logits; minus infinity gives zero.
-        softness: the paper's tau, in (0, 1).
+        logits: positive inside; minus infinity (no box holds the point) gives zero.
+        softness: 1 gives the occupancy; the paper's tau, 0.05, a gentle slope by which near and
+            far outside differ.
 
-    Source: paper Sec. 3.3, Eq. 3.
+    Source: paper Sec. 3.2, Eq. 1 (sigma, softness 1) and Sec. 3.3, Eq. 3 (softness tau).
     """
     return torch.sigmoid(softness * logits)
 
@@ -113,7 +105,7 @@ class MaximumFusion:
     ) -> Float[Tensor, "slots"]:
         """Value of each slot (a part at a point): sigmoid of ``slope`` times the largest logit."""
         lowest = logits.new_full((num_slots,), -torch.inf)
-        return torch.sigmoid(slope * lowest.scatter_reduce(0, slots, logits, "amax"))
+        return soft_occupancy(lowest.scatter_reduce(0, slots, logits, "amax"), slope)
 
     def over_parts(self, parts: Float[Tensor, "points bones"]) -> Float[Tensor, "points"]:
         """Value of the whole hand.
@@ -151,7 +143,7 @@ class SoftmaxFusion:
         slope: float,
     ) -> Float[Tensor, "slots"]:
         """Softmax-weighted mean of the sigmoids in each slot; zero where there are none."""
-        values = torch.sigmoid(slope * logits)
+        values = soft_occupancy(logits, slope)
         weights = (values / self.temperature).exp()
         empty = logits.new_zeros(num_slots)
         total = empty.scatter_add(0, slots, weights)
@@ -321,7 +313,7 @@ class PairOccupancy(nn.Module):
         members = self.pairs[pair_index]
         rows = row_of[members, point_index[:, None]]
         tokens = features[rows]
-        blocks = list(self.decoder.pointnet.blocks)
+        blocks = cast(list[ResidualBlock], list(self.decoder.pointnet.blocks))
         for block in blocks[1:-1]:
             tokens = _paired_block(block, tokens, tokens.amax(1))
         is_wanted = is_in_box[point_index[:, None], members]
@@ -377,7 +369,7 @@ def local_points(
     """
     rotation = boxes.bone_from_world[:, :3, :3].reshape(-1, 3)
     shift = boxes.bone_from_world[:, :3, 3].reshape(-1)
-    return (points @ rotation.T + shift).view(len(points), -1, 3)
+    return (points @ rotation.T + shift).view(len(points), len(boxes.lower), 3)
 
 
 def contains(

@@ -1,5 +1,7 @@
 """The personal rest shape: per-vertex offsets that depend on place and pose."""
 
+from typing import cast
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -44,7 +46,7 @@ class ShapeOffsets(nn.Module):
         centre = rest.rig.template_vertices.mean(0)
         encoded = positional_encoding((vertices - centre) / HAND_SCALE, NUM_FREQUENCIES)
         # The pose is the same for every vertex: its share of the first layer is a bias.
-        first = self.mlp.hidden[0]
+        first = cast(nn.Linear, self.mlp.hidden[0])
         width = encoded.shape[-1]
         pose = rotations[1:].flatten()
         bias = first.bias + first.weight[:, width:] @ pose

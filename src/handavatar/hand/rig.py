@@ -8,6 +8,7 @@ of faces, for everything that asks what is inside.
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -102,10 +103,11 @@ class Rig:
 
     def to(self, device: torch.device | str) -> "Rig":
         """The same rig on another device."""
-        moved = {
-            name: value.to(device) for name, value in vars(self).items() if torch.is_tensor(value)
+        fields: dict[str, Any] = {
+            name: value.to(device)
+            for name, value in vars(self).items()
+            if torch.is_tensor(value) and name in self.__dataclass_fields__
         }
-        fields = {name: value for name, value in moved.items() if name in self.__dataclass_fields__}
         sets = {name: value.to(device) for name, value in self.vertex_sets.items()}
         return replace(self, vertex_sets=sets, **fields)
 

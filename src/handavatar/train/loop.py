@@ -2,6 +2,7 @@
 
 import math
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from handavatar.avatar import HandAvatar, RenderSettings
 from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
+from handavatar.capture.view import view_of
 from handavatar.evaluate.perceptual import PerceptualLoss, perceptual_loss
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside, unique_edges
@@ -178,7 +180,7 @@ def train(options: TrainOptions) -> Path:
     frames = [capture.frame(index) for index in indices]
     perceptual = perceptual_loss(options.perceptual).to(device)
     training = begin_training(capture, len(frames), method, options)
-    training.avatar.moved_to(device)
+    training.avatar.info["view"] = view_of(frames)
     run = _open_or_create(options, capture, perceptual.name, steps)
     with locked(run), _stop_signals() as stopped:
         start = _restore(run, training)
@@ -240,8 +242,7 @@ def begin_training(
     avatar = HandAvatar(rig, capture.shape_coefficients, info=info)
     load_prior(avatar.occupancy, options.prior)
     avatar.occupancy.encoder.requires_grad_(False)
-    is_tracked = capture.source.startswith("video")
-    corrections = PoseCorrections(num_frames) if is_tracked else None
+    corrections = PoseCorrections(num_frames) if capture.is_tracked else None
     device = chosen_device(options.device)
     avatar.moved_to(device)
     groups: list[dict[str, Any]] = [
@@ -456,18 +457,19 @@ def _named(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 def _stop_signals() -> Iterator[Any]:
     """Turns the first SIGINT or SIGTERM into a wish to stop; the second one kills."""
     received: list[int] = []
+    watched = (signal.SIGINT, signal.SIGTERM)
 
     def note(number: int, _: Any) -> None:
         received.append(number)
-        signal.signal(number, before[number])
+        for watched_number, handler in zip(watched, before, strict=True):
+            signal.signal(watched_number, handler)
 
-    try:
-        before = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
-    except ValueError:  # Not in the main thread: signals are the caller's business.
-        yield lambda: False
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False  # Signals are the caller's business.
         return
+    before = [signal.signal(number, note) for number in watched]
     try:
         yield lambda: bool(received)
     finally:
-        for number, handler in before.items():
+        for number, handler in zip(watched, before, strict=True):
             signal.signal(number, handler)

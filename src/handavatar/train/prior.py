@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from handavatar.avatar import CheckpointError
 from handavatar.field.occupancy import PairOccupancy
 from handavatar.geometry.meshes import is_inside, sample_surface
 from handavatar.geometry.rotations import apply_rigid
@@ -208,16 +209,16 @@ def load_prior(field: PairOccupancy, path: Path = SHIPPED_PRIOR) -> None:
     """Loads pre-trained weights into a field.
 
     Raises:
-        ValueError: if the file is missing, damaged or of another structure.
+        CheckpointError: if the file is missing, damaged or of another structure.
     """
     if not path.is_file():
-        raise ValueError(
+        raise CheckpointError(
             f"no occupancy prior at {path}: train one with `handavatar prior train --out {path}`"
         )
     try:
         field.load_state_dict(load_file(path))
     except Exception as error:
-        raise ValueError(f"{path} is not a usable occupancy prior: {error}") from error
+        raise CheckpointError(f"{path} is not a usable occupancy prior: {error}") from error
 
 
 @dataclass(frozen=True)
