@@ -200,7 +200,7 @@ class PairOccupancy(nn.Module):
         fusion: MaximumFusion | SoftmaxFusion | None = None,
         softness: float = 0.05,
         margin: float = 0.012,
-        chunk: int = 2048,
+        chunk: int = 1024,
     ) -> None:
         """Builds an untrained field.
 
