@@ -5,6 +5,8 @@ First the landmarks alone decide; then the mesh's outline is drawn to the mask's
 """
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -25,6 +27,7 @@ _FINGERS = ("thumb", "index", "middle", "ring", "little")
 _PALM_LANDMARKS = (0, 1, 5, 9, 13, 17)
 _RETRY_GESTURES = ("fist", "relaxed", "pinch")
 _BAD_RATIO = 1.6
+_OUTLINE_WEIGHT = 48
 
 
 @dataclass(frozen=True)
@@ -224,6 +227,18 @@ def projected(
     return points[..., :2] / points[..., 2:].clamp_min(0.02) * focal + center
 
 
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """One thread for small tensors: waiting for a second one costs up to fifty times the work."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@single_threaded()
 def fit_hands(
     rig: Rig,
     observations: Observations,
@@ -339,6 +354,7 @@ def placed(model: HandModel, observations: Observations, fit: HandFit) -> HandFi
     return replace(fit, translation=torch.cat([translation[:, :2], depth[:, None]], dim=1))
 
 
+@single_threaded()
 def refined(
     model: HandModel,
     observations: Observations,
@@ -466,8 +482,8 @@ def _outline_energy(
     expected = (options.outline_error * observations.scale[:, None]).clamp_min(1.0)
     terms = _robust((across.square() + 0.02 * along.square() + 1e-9).sqrt() / expected)
     share = (terms * pairs.weights).sum(-1) / pairs.weights.sum(-1).clamp_min(1.0)
-    # Neighbouring outline points err together: all of them weigh as much as two dozen.
-    return 24 * share
+    # Neighbouring outline points err together: all of them weigh as much as this many.
+    return _OUTLINE_WEIGHT * share
 
 
 def _pose_energy(rig: Rig, rotations: Float[Tensor, "frames bones 3"]) -> Float[Tensor, "frames"]:

@@ -24,6 +24,7 @@ from handavatar.capture.fitting import (
     Observations,
     fit_hands,
     landmark_errors,
+    single_threaded,
 )
 from handavatar.capture.frames import Capture, CaptureWriter, Frame, read_capture
 from handavatar.capture.masks import HandMask, find_mask, learn_colors, pixels_per_metre
@@ -146,7 +147,7 @@ def capture_video(
             f"could be fitted with confidence; at least {_MIN_KEPT} are needed",
             "record slower movements, in better light, before a plain background",
         )
-    splits = _splits(len(kept))
+    splits = held_out_splits(len(kept))
     with CaptureWriter(
         options.out,
         side=track.side,
@@ -189,6 +190,7 @@ def observations_of(track: Track) -> Observations:
     )
 
 
+@single_threaded()
 def _fitted(
     track: Track, masks: list[HandMask], rig: Rig, options: VideoOptions, report: Progress
 ) -> tuple[HandFit, list[FittedFrame]]:
@@ -322,8 +324,8 @@ def _box(mask: Bool[np.ndarray, "side side"]) -> tuple[tuple[float, float], floa
     return (float(x), float(y)), side
 
 
-def _splits(count: int) -> list[str]:
-    """Two stretches of time are held out, together a sixth of the frames."""
+def held_out_splits(count: int) -> list[str]:
+    """Two stretches of time are held out for tests, together at least 15 % of the frames."""
     splits = ["train"] * count
     for start, share in _HELD_OUT:
         first, length = round(start * count), int(np.ceil(share * count))

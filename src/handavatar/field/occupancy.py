@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from handavatar.field.layers import PointNet, ResidualBlock, SkipMLP
+from handavatar.field.threads import mapped
 from handavatar.hand.parts import PartBoxes, Parts
 from handavatar.hand.pose import CONNECTED_PAIRS, NUM_BONES
 from handavatar.hand.rig import PosedHand
@@ -231,10 +232,8 @@ class PairOccupancy(nn.Module):
     def forward(self, codes: HandCodes, points: Float[Tensor, "points 3"]) -> Occupancy:
         """Occupancy at world points (metres), without gradient; the fast way."""
         starts = range(0, max(len(points), 1), self.chunk)
-        with torch.no_grad():
-            pieces = [
-                self._chunk_occupancy(codes, points[start : start + self.chunk]) for start in starts
-            ]
+        chunks = [points[start : start + self.chunk] for start in starts]
+        pieces = mapped(lambda chunk: self._chunk_occupancy(codes, chunk), chunks)
         items = PairItems(
             torch.cat([p.items.points + start for p, start in zip(pieces, starts, strict=True)]),
             torch.cat([p.items.pairs for p in pieces]),

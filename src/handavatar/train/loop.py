@@ -85,7 +85,7 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "quick": Method(
-        steps=500,
+        steps=400,
         frames=1,
         patches=1,
         patch_size=32,
@@ -338,13 +338,16 @@ def frame_losses(
         [patch_pixels(frame.mask, method.patch_size, generator) for _ in range(method.patches)]
     )
     x, y = pixels.unbind(-1)
-    centers = pixel_centers(camera)[y, x]
-    seen = avatar.render_rays(state, rays_through_pixels(camera, centers), settings, generator)
+    near = avatar.near_mesh(state, camera, settings.mask_margin)[y, x].nonzero()[:, 0]
+    rays = rays_through_pixels(camera, pixel_centers(camera)[y, x][near])
+    seen = avatar.render_rays(state, rays, settings, generator)
+    black = torch.zeros(len(x), device=device)
+    alpha = black.index_copy(0, near, seen.alpha)[:, None]
     background = torch.rand(3, generator=generator).to(device)
     truth = frame.image[y, x].to(device).float() / 255
     is_hand = frame.mask[y, x].to(device)
     truth = torch.where(is_hand[:, None], truth, background)
-    color = seen.color + (1 - seen.alpha[:, None]) * background
+    color = black[:, None].repeat(1, 3).index_copy(0, near, seen.color) + (1 - alpha) * background
     losses["color"] = color_loss(color, truth)
     size = (method.patches, method.patch_size, method.patch_size)
     losses["perceptual"] = perceptual(color.unflatten(0, size), truth.unflatten(0, size)).mean()

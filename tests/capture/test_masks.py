@@ -1,0 +1,109 @@
+"""The colour model against slow references, and a made hand that is cut out again."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.special import logsumexp
+from scipy.stats import multivariate_normal
+
+from handavatar.capture.fitting import HandFit, HandModel, projected
+from handavatar.capture.masks import (
+    GaussianMixture,
+    find_mask,
+    fit_mixture,
+    learn_colors,
+    oklab_from_srgb,
+    pixels_per_metre,
+)
+from handavatar.capture.outlines import silhouette, window_camera
+from handavatar.capture.tracking import TrackedHand, Window
+from handavatar.geometry.rotations import axis_angle_from_matrix
+from handavatar.hand.open_hand import load_open_hand
+from handavatar.hand.pose_sampling import gesture_rotations
+
+SIDE = 320
+PICTURE = (400, 400)
+CORNER = (40.0, 40.0)
+
+
+def test_oklab_of_known_colours() -> None:
+    colors = np.array([[255, 255, 255], [0, 0, 0], [255, 0, 0]], dtype=np.uint8)
+    # From the definition of OKLab (B. Ottosson); white has no hue.
+    expected = np.array([[1, 0, 0], [0, 0, 0], [0.62796, 0.22486, 0.12585]])
+    assert np.allclose(oklab_from_srgb(colors), expected, atol=2e-4)
+
+
+def test_the_density_equals_the_slow_reference() -> None:
+    generator = np.random.default_rng(0)
+    means = generator.normal(size=(2, 3))
+    covariances = [np.diag([0.1, 0.2, 0.3]), np.eye(3) * 0.5 + 0.1]
+    mixture = GaussianMixture(np.array([0.3, 0.7]), means, np.linalg.inv(np.array(covariances)))
+    points = generator.normal(size=(20, 3))
+    parts = [
+        np.log(weight) + multivariate_normal(mean, covariance).logpdf(points)
+        for weight, mean, covariance in zip((0.3, 0.7), means, covariances, strict=True)
+    ]
+    assert np.allclose(mixture.log_density(points), logsumexp(parts, axis=0))
+
+
+def test_a_mixture_finds_two_clusters() -> None:
+    generator = np.random.default_rng(0)
+    centers = np.array([[0.3, 0.0, 0.1], [0.7, 0.1, 0.0]])
+    share = np.repeat(centers, [300, 700], axis=0)
+    mixture = fit_mixture(share + 0.02 * generator.normal(size=(1000, 3)), 2, generator)
+    order = np.argsort(mixture.means[:, 0])
+    assert np.allclose(mixture.means[order], centers, atol=0.005)
+    assert np.allclose(mixture.weights[order], [0.3, 0.7], atol=0.01)
+
+
+def _made_hand(number: int) -> tuple[TrackedHand, np.ndarray]:
+    """A shaded skin-coloured hand before a striped wall, and its true mask."""
+    rig = load_open_hand("778")
+    generator = np.random.default_rng(number)
+    rotations = gesture_rotations(rig, "spread")[None].clone()
+    upright = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    rotations[0, 0] = axis_angle_from_matrix(upright)
+    shape = torch.zeros(rig.shape_directions.shape[-1])
+    fit = HandFit(
+        rotations,
+        torch.tensor([[0.005 * number - 0.02, 0.10, 0.5]]),
+        shape,
+        torch.tensor(400.0).log(),
+        torch.zeros(21, 3),
+    )
+    model = HandModel(rig)
+    camera = window_camera(400.0, PICTURE, CORNER, SIDE, SIDE)
+    mask = silhouette(rig, model.all_vertices(fit)[0], camera)
+    y, x = np.mgrid[:SIDE, :SIDE]
+    wall = np.stack([110 + 25 * (x // 40 % 2), 120 + 0 * x, 130 + 20 * (y // 60 % 2)], axis=-1)
+    shade = 0.7 + 0.3 * x / SIDE
+    skin = np.array([205.0, 150.0, 120.0]) * shade[..., None]
+    image = np.where(mask[..., None], skin, wall) + generator.normal(0, 5, (SIDE, SIDE, 3))
+    points = model.landmarks(fit)
+    hand = TrackedHand(
+        index=number,
+        time=number / 10,
+        window=Window(image.clip(0, 255).astype(np.uint8), CORNER, 1.0, PICTURE),
+        landmarks=projected(points, fit.log_focal.exp(), PICTURE)[0].double().numpy(),
+        spread=np.ones(21),
+        world_landmarks=(points - points.mean(1, keepdim=True))[0].double().numpy(),
+        presence=0.95,
+    )
+    return hand, mask
+
+
+def test_a_made_hand_is_cut_out_again() -> None:
+    pytest.importorskip("cv2")
+    made = [_made_hand(number) for number in range(4)]
+    colors = learn_colors([hand for hand, _ in made])
+    hand, truth = made[2]
+    found = find_mask(hand, colors)
+    overlap = (found.pixels & truth).sum() / (found.pixels | truth).sum()
+    assert overlap > 0.97
+    assert found.quality > 0.9
+
+
+def test_scale_is_focal_length_over_depth() -> None:
+    hand, _ = _made_hand(0)
+    # 400 pixels at about half a metre; the hand's own depth range is a few per cent of that.
+    assert pixels_per_metre(hand) == pytest.approx(800, rel=0.05)

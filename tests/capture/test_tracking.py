@@ -1,0 +1,164 @@
+"""Following one hand: what is kept, skipped, mirrored and refused."""
+
+import sys
+
+import numpy as np
+import pytest
+from videos import REAL_VIDEO, needs_real_video
+
+from handavatar.capture import tracking
+from handavatar.capture.checks import CaptureError
+from handavatar.capture.decoding import VideoFrame, video_frames
+from handavatar.capture.tracking import (
+    LANDMARK_NAMES,
+    Sighting,
+    resampled,
+    track_hand,
+    window_around,
+)
+
+WIDTH, HEIGHT = 320, 240
+
+
+def _sighting(right: bool, shift: float = 0.0) -> Sighting:
+    generator = np.random.default_rng(0)
+    landmarks = generator.uniform((40, 60), (120, 160), (21, 2)) + (shift, 0)
+    world = generator.uniform(-0.1, 0.1, (21, 3))
+    return Sighting(landmarks, world, 0.9, right)
+
+
+def _frames(count: int) -> list[VideoFrame]:
+    """The grey level is the number of the frame: all that the false finder looks at."""
+    return [
+        VideoFrame(i, i / 10, np.full((HEIGHT, WIDTH, 3), i, dtype=np.uint8)) for i in range(count)
+    ]
+
+
+def _install(monkeypatch: pytest.MonkeyPatch, seen: dict[int, list[Sighting]]) -> None:
+    """A finder that sees one right hand, but in some frames what ``seen`` says."""
+
+    class FalseFinder:
+        def __enter__(self) -> "FalseFinder":
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            return None
+
+        def track(self, image: np.ndarray) -> list[Sighting]:
+            return seen.get(int(image[0, 0, 0]), [_sighting(True)])
+
+        def look_closely(
+            self, image: np.ndarray, around: np.ndarray, turn: float
+        ) -> Sighting | None:
+            found = self.track(image)
+            return found[0] if found else None
+
+    monkeypatch.setattr(tracking, "HandFinder", FalseFinder)
+
+
+def test_names_follow_the_tracker_s_order() -> None:
+    assert len(LANDMARK_NAMES) == 21
+    assert LANDMARK_NAMES[4] == "thumb_tip" and LANDMARK_NAMES[17] == "little_mcp"
+
+
+def test_a_few_frames_without_or_with_two_hands_are_skipped_by_name(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _install(monkeypatch, {3: [], 5: [_sighting(True), _sighting(False, 150)]})
+    track = track_hand(_frames(20))
+    assert track.skipped == {3: "no hand found", 5: "two hands"}
+    assert track.side == "right" and len(track.hands) == 18
+    assert track.picture_size == (WIDTH, HEIGHT)
+
+
+def test_two_hands_all_along_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    both = [_sighting(True), _sighting(False, 150)]
+    _install(monkeypatch, {i: both for i in range(4)})
+    with pytest.raises(CaptureError, match="two hands in 4 of 20"):
+        track_hand(_frames(20))
+
+
+def test_no_hand_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    _install(monkeypatch, {i: [] for i in range(20)})
+    with pytest.raises(CaptureError, match="found in 0 of 20"):
+        track_hand(_frames(20))
+
+
+def test_a_left_hand_is_mirrored_to_a_right_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    _install(monkeypatch, {i: [_sighting(False)] for i in range(10)})
+    track = track_hand(_frames(10))
+    assert track.side == "left"
+    seen, hand = _sighting(False), track.hands[0]
+    assert np.allclose(hand.landmarks[:, 0], WIDTH - seen.landmarks[:, 0])
+    assert np.allclose(hand.landmarks[:, 1], seen.landmarks[:, 1])
+    assert np.allclose(hand.world_landmarks, seen.world_landmarks * (-1, 1, 1))
+    # Overruled, the same pictures stay as they are.
+    assert np.allclose(track_hand(_frames(10), "right").hands[0].landmarks, seen.landmarks)
+
+
+def test_mirroring_a_window_and_a_point_commute() -> None:
+    image = np.random.default_rng(1).integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    landmarks = np.array([[60.0, 50.0], [180.0, 150.0]]).repeat([10, 11], axis=0)
+    window = window_around(image, landmarks)
+    other = window.mirrored()
+    side = window.image.shape[0]
+    point = np.array([100.0, 80.0])
+    x, y = window.from_picture(point)
+    assert np.allclose(other.from_picture(np.array([WIDTH - 100.0, 80.0])), [side - x, y])
+    assert (other.mirrored().image == window.image).all()
+    assert np.allclose(other.mirrored().corner, window.corner)
+
+
+def test_resampling_keeps_the_picture_where_it_is() -> None:
+    image = np.random.default_rng(2).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    assert (resampled(image, np.eye(2), np.zeros(2), 64) == image).all()
+    # A quarter turn about the middle; bilinear weights round by one step.
+    quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
+    turned = resampled(image, quarter, np.array([64.0, 0.0]), 64)
+    assert np.abs(turned.astype(int) - np.rot90(image).astype(int)).max() <= 1
+    half = resampled(image, 2 * np.eye(2), np.zeros(2), 32)
+    mean = image.reshape(32, 2, 32, 2, 3).mean((1, 3))
+    assert np.abs(half - mean).max() <= 1
+
+
+def test_without_the_extra_the_error_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "mediapipe.python.solutions.hands", None)
+    with pytest.raises(CaptureError, match=r"handavatar\[video\]"):
+        track_hand(_frames(1))
+
+
+def test_a_picture_without_a_hand_shows_none() -> None:
+    pytest.importorskip("mediapipe")
+    noise = np.random.default_rng(3).integers(90, 160, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+    with pytest.raises(CaptureError, match="found in 0 of 3"):
+        track_hand([VideoFrame(i, i / 10, noise) for i in range(3)])
+
+
+@pytest.mark.real
+@needs_real_video
+def test_the_real_hand_is_a_right_one_and_its_mirror_image_a_left_one() -> None:
+    pytest.importorskip("mediapipe")
+    frames = list(video_frames(REAL_VIDEO, max_frames=8))
+    right = track_hand(frames)
+    mirrored = [VideoFrame(f.index, f.time, np.ascontiguousarray(f.image[:, ::-1])) for f in frames]
+    left = track_hand(mirrored)
+    assert (right.side, left.side) == ("right", "left")
+    apart = [
+        np.linalg.norm(a.landmarks - b.landmarks, axis=-1).mean()
+        for a, b in zip(right.hands, left.hands, strict=True)
+    ]
+    # The hand is some 290 pixels large; the network is not exactly symmetric.
+    assert max(apart) < 6
+
+
+@pytest.mark.real
+@needs_real_video
+def test_two_real_hands_are_refused() -> None:
+    pytest.importorskip("mediapipe")
+    frames = list(video_frames(REAL_VIDEO, max_frames=4))
+    doubled = [
+        VideoFrame(f.index, f.time, np.concatenate([f.image[:, 400:1100]] * 2, axis=1))
+        for f in frames
+    ]
+    with pytest.raises(CaptureError, match="two hands"):
+        track_hand(doubled)
