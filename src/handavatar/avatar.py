@@ -33,6 +33,8 @@ from handavatar.render.sampling import depths_along, intervals_through_boxes
 from handavatar.render.volume import composite_sparse, visibility
 
 SCHEMA = 1
+START_LIGHT = 0.65
+"""Illumination of an untrained avatar: room to grow brighter and darker."""
 _RIG_TENSORS = (
     "template_vertices",
     "faces",
@@ -187,6 +189,21 @@ class HandAvatar(nn.Module):
         self.rig = self.rig.to(device)
         self.parts = self.parts.to(device)
         return self
+
+    @torch.no_grad()
+    def start_from_color(self, color: Float[Tensor, "3"]) -> None:
+        """Makes an untrained avatar one even colour under one even light.
+
+        Departs: the authors start from random colours; from here less is to be unlearned.
+
+        Args:
+            color: mean colour of the hand's pixels, in [0, 1].
+        """
+        self.illumination.mlp.output.weight.mul_(0.1)
+        self.illumination.mlp.output.bias.fill_(math.log(START_LIGHT / (1 - START_LIGHT)))
+        albedo = (color / START_LIGHT).clamp(0.05, 0.95)
+        self.albedo.mlp.output.weight.mul_(0.1)
+        self.albedo.mlp.output.bias.copy_(torch.logit(albedo))
 
     def personal(self, pose: HandPose) -> ShapedHand:
         """The personal rest hand of a pose (paper Sec. 3.1)."""

@@ -13,7 +13,7 @@ from handavatar.capture.decoding import video_frames
 
 def test_every_third_picture_of_thirty_per_second(tmp_path: Path) -> None:
     path = save_video(tmp_path / "a.mp4", grey_levels(30))
-    frames = list(video_frames(path, fps=10))
+    frames = list(video_frames(path, fps=10.0))
     assert [frame.index for frame in frames] == list(range(0, 30, 3))
     assert np.allclose([frame.time for frame in frames], np.arange(10) / 10, atol=1e-3)
     levels = [float(frame.image[90:, :, 2].mean()) for frame in frames]
@@ -24,12 +24,12 @@ def test_every_third_picture_of_thirty_per_second(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["a.mp4", "a.mov", "a.mkv"])
 def test_common_containers_open(tmp_path: Path, name: str) -> None:
     path = save_video(tmp_path / name, grey_levels(6))
-    assert len(list(video_frames(path, fps=30))) == 6
+    assert len(list(video_frames(path, fps=30.0))) == 6
 
 
 def test_stops_at_the_greatest_number_of_pictures(tmp_path: Path) -> None:
     path = save_video(tmp_path / "a.mp4", grey_levels(20))
-    assert len(list(video_frames(path, fps=30, max_frames=4))) == 4
+    assert len(list(video_frames(path, fps=30.0, max_frames=4))) == 4
 
 
 def test_large_pictures_are_brought_down(tmp_path: Path) -> None:

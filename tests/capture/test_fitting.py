@@ -175,7 +175,9 @@ def test_the_outline_of_a_disc_points_outwards() -> None:
     # Twice the window's pixels; the border is known to a pixel of the window.
     assert np.abs(radius - 60).max() < 2.0
     assert ((apart / radius[:, None]) * outline.normals).sum(-1).min() > 0.97
-    assert outline.covers(np.array([center, center + [70, 0], [-5.0, 10.0]])).tolist() == [
+    assert outline.covers(
+        np.stack([center, center + np.array([70, 0]), np.array([-5.0, 10.0])])
+    ).tolist() == [
         True,
         False,
         True,

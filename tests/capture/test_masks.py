@@ -72,7 +72,7 @@ def _made_hand(number: int) -> tuple[TrackedHand, np.ndarray]:
         torch.zeros(21, 3),
     )
     model = HandModel(rig)
-    camera = window_camera(400.0, PICTURE, CORNER, SIDE, SIDE)
+    camera = window_camera(400.0, PICTURE, CORNER, float(SIDE), SIDE)
     mask = silhouette(rig, model.all_vertices(fit)[0], camera)
     y, x = np.mgrid[:SIDE, :SIDE]
     wall = np.stack([110 + 25 * (x // 40 % 2), 120 + 0 * x, 130 + 20 * (y // 60 % 2)], axis=-1)

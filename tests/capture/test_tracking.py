@@ -11,6 +11,7 @@ from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import VideoFrame, video_frames
 from handavatar.capture.tracking import (
     LANDMARK_NAMES,
+    HandFinder,
     Sighting,
     resampled,
     track_hand,
@@ -22,7 +23,7 @@ WIDTH, HEIGHT = 320, 240
 
 def _sighting(right: bool, shift: float = 0.0) -> Sighting:
     generator = np.random.default_rng(0)
-    landmarks = generator.uniform((40, 60), (120, 160), (21, 2)) + (shift, 0)
+    landmarks = generator.uniform((40, 60), (120, 160), (21, 2)) + np.array([shift, 0])
     world = generator.uniform(-0.1, 0.1, (21, 3))
     return Sighting(landmarks, world, 0.9, right)
 
@@ -37,9 +38,9 @@ def _frames(count: int) -> list[VideoFrame]:
 def _install(monkeypatch: pytest.MonkeyPatch, seen: dict[int, list[Sighting]]) -> None:
     """A finder that sees one right hand, but in some frames what ``seen`` says."""
 
-    class FalseFinder:
-        def __enter__(self) -> "FalseFinder":
-            return self
+    class FalseFinder(HandFinder):
+        def __init__(self) -> None:
+            pass
 
         def __exit__(self, *_: object) -> None:
             return None

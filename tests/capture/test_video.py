@@ -1,11 +1,14 @@
 """A video becomes a capture."""
 
 import json
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
+from scipy import ndimage
 from videos import REAL_VIDEO, grey_levels, needs_real_video, save_video
 
 from handavatar.capture.checks import CaptureError
@@ -21,7 +24,7 @@ def test_two_blocks_of_time_are_held_out(count: int) -> None:
     splits = held_out_splits(count)
     assert len(splits) == count and set(splits) == {"train", "test"}
     assert 0.15 <= splits.count("test") / count <= 0.3
-    changes = sum(a != b for a, b in zip(splits[:-1], splits[1:], strict=True))
+    changes = sum(a != b for a, b in pairwise(splits))
     assert changes == 4 and splits[0] == splits[-1] == "train"
 
 
@@ -68,7 +71,8 @@ def test_the_real_hand_becomes_a_sound_capture(tmp_path: Path) -> None:
     vertices, depth = project(frame.camera, hand.posed(frame.pose).vertices)
     assert 0.4 < float(depth.mean()) < 1.5
     x, y = vertices.round().long().clamp(0, 255).unbind(-1)
-    assert frame.mask[y, x].float().mean() > 0.9
+    near = torch.from_numpy(ndimage.binary_dilation(frame.mask.numpy(), iterations=4))
+    assert near[y, x].float().mean() > 0.95
     # A box of 1.3 times the hand: the mask touches no side and fills the middle.
     rows, columns = np.nonzero(frame.mask.numpy())
     extent = max(np.ptp(rows), np.ptp(columns)) + 1

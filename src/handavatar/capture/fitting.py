@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float, Int
@@ -135,6 +135,7 @@ class OutlinePairs:
     weights: Float[Tensor, "frames pairs"]
 
 
+@runtime_checkable
 class PairFinder(Protocol):
     """Knows the outlines that were seen, one per frame."""
 

@@ -10,6 +10,8 @@ from handavatar.hand.pose import NUM_BONES
 
 NUM_FREQUENCIES = 3
 CODE_WIDTH = 128
+CODE_SPREAD = 0.1
+"""Standard deviation of the codes at the start; small ones start as one even colour."""
 POSITION_SCALE = 0.1
 """Anchor positions are divided by this (metres) before they are encoded."""
 
@@ -33,7 +35,7 @@ class AlbedoField(nn.Module):
     def __init__(self, num_anchors: int) -> None:
         """Random codes."""
         super().__init__()
-        self.codes = nn.Parameter(torch.randn(num_anchors, CODE_WIDTH))
+        self.codes = nn.Parameter(CODE_SPREAD * torch.randn(num_anchors, CODE_WIDTH))
         self.mlp = MLP(CODE_WIDTH, 256, 4, 3)
 
     def forward(self, neighbours: Neighbours) -> Float[Tensor, "queries 3"]:

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar, RenderSettings
 from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
 from handavatar.capture.view import view_of
+from handavatar.evaluate.metrics import mean_color
 from handavatar.evaluate.perceptual import PerceptualLoss, perceptual_loss
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside, unique_edges
@@ -55,6 +56,9 @@ class Method:
         frames: frames per step.
         patches: patches per frame.
         patch_size: pixels along a side.
+        patch_strides: a patch takes every pixel, or every second, ...; drawn for each patch. Wide
+            patches show more of the hand for the same work.
+        perceptual_weight: of the perceptual loss beside the colour loss.
         num_samples: samples per ray while training.
         silhouette_size: the mask is compared at this many pixels along a side.
         lr: learning rate of albedo and illumination at the start.
@@ -73,6 +77,8 @@ class Method:
     patch_size: int
     num_samples: int
     silhouette_size: int
+    patch_strides: tuple[int, ...] = (1,)
+    perceptual_weight: float = 1.0
     lr: float = 5e-4
     lr_shape: float = 5e-4
     lr_codes: float = 5e-4
@@ -91,6 +97,8 @@ METHODS: dict[str, Method] = {
         patch_size=32,
         num_samples=32,
         silhouette_size=128,
+        patch_strides=(1, 2, 4),
+        perceptual_weight=0.1,
         lr=2e-3,
         lr_codes=1e-2,
         occupancy_every=4,
@@ -179,7 +187,7 @@ def train(options: TrainOptions) -> Path:
         )
     frames = [capture.frame(index) for index in indices]
     perceptual = perceptual_loss(options.perceptual).to(device)
-    training = begin_training(capture, len(frames), method, options)
+    training = begin_training(capture, frames, method, options)
     training.avatar.info["view"] = view_of(frames)
     run = _open_or_create(options, capture, perceptual.name, steps)
     with locked(run), _stop_signals() as stopped:
@@ -221,7 +229,7 @@ def chosen_device(name: str) -> torch.device:
 
 
 def begin_training(
-    capture: Capture, num_frames: int, method: Method, options: TrainOptions
+    capture: Capture, frames: list[Frame], method: Method, options: TrainOptions
 ) -> Training:
     """An untrained avatar of the capture's person with the prior's geometry, and its optimiser."""
     rig = load_open_hand()
@@ -241,8 +249,13 @@ def begin_training(
     }
     avatar = HandAvatar(rig, capture.shape_coefficients, info=info)
     load_prior(avatar.occupancy, options.prior)
+    avatar.start_from_color(
+        mean_color(
+            [frame.image.float() / 255 for frame in frames], [frame.mask for frame in frames]
+        )
+    )
     avatar.occupancy.encoder.requires_grad_(False)
-    corrections = PoseCorrections(num_frames) if capture.is_tracked else None
+    corrections = PoseCorrections(len(frames)) if capture.is_tracked else None
     device = chosen_device(options.device)
     avatar.moved_to(device)
     groups: list[dict[str, Any]] = [
@@ -325,9 +338,10 @@ def frame_losses(
     losses["offsets"] = 0.1 * offset_loss(state.offsets, edges)
 
     if step % method.occupancy_every == 0:
+        margin = avatar.occupancy.margin
         points = sample_points(
-            avatar.parts, state.posed, method.occupancy_points, avatar.occupancy.margin, generator
-        ).detach()
+            avatar.parts, state.posed, method.occupancy_points, margin, generator
+        ).to(device)
         labels = is_inside(state.posed.sealed_vertices, avatar.rig.sealed_faces, points)
         items = avatar.occupancy(state.codes, points).items
         predicted = avatar.occupancy.of_items(state.codes, points, items)
@@ -335,7 +349,10 @@ def frame_losses(
 
     settings = RenderSettings(num_samples=method.num_samples, smallest_weight=1e-6, stop=1e-5)
     pixels = torch.cat(
-        [patch_pixels(frame.mask, method.patch_size, generator) for _ in range(method.patches)]
+        [
+            patch_pixels(frame.mask, method.patch_size, method.patch_strides, generator)
+            for _ in range(method.patches)
+        ]
     )
     x, y = pixels.unbind(-1)
     near = avatar.near_mesh(state, camera, settings.mask_margin)[y, x].nonzero()[:, 0]
@@ -350,38 +367,52 @@ def frame_losses(
     color = black[:, None].repeat(1, 3).index_copy(0, near, seen.color) + (1 - alpha) * background
     losses["color"] = color_loss(color, truth)
     size = (method.patches, method.patch_size, method.patch_size)
-    losses["perceptual"] = perceptual(color.unflatten(0, size), truth.unflatten(0, size)).mean()
+    distance = perceptual(color.unflatten(0, size), truth.unflatten(0, size)).mean()
+    losses["perceptual"] = method.perceptual_weight * distance
     losses["squared_error"] = (color.detach() - truth).square().mean()
     return losses
 
 
-def patch_pixels(mask: Tensor, size: int, generator: torch.Generator) -> Int[Tensor, "pixels 2"]:
-    """Pixels (x, y) of a square patch that lies on the hand.
+def patch_pixels(
+    mask: Bool[Tensor, "height width"],
+    size: int,
+    strides: tuple[int, ...],
+    generator: torch.Generator,
+) -> Int[Tensor, "pixels 2"]:
+    """Pixels (x, y) of a square patch that lies on the hand, row by row.
 
     The centre is a pixel of the mask four times out of five, else one of the square around it.
+
+    Args:
+        mask: true on the hand.
+        size: pixels along a side.
+        strides: steps between the pixels; one is drawn among those that fit the picture.
+        generator: draws stride and place.
 
     Raises:
         CaptureError: if the picture is smaller than the patch.
     """
     height, width = mask.shape
-    if min(height, width) < size:
+    fitting = [stride for stride in strides if (size - 1) * stride < min(height, width)]
+    if not fitting:
         raise CaptureError(
             f"pictures of {width} x {height} pixels are smaller than a {size} x {size} patch",
             "make the capture with larger pictures",
         )
+    stride = fitting[int(torch.randint(len(fitting), (), generator=generator))]
+    extent = (size - 1) * stride + 1
     on_hand = mask.nonzero()
     if len(on_hand) == 0:
         center = torch.tensor([height // 2, width // 2])
     elif float(torch.rand((), generator=generator)) < 0.8:
-        center = on_hand[torch.randint(len(on_hand), (), generator=generator)]
+        center = on_hand[int(torch.randint(len(on_hand), (), generator=generator))]
     else:
         lower, upper = on_hand.amin(0), on_hand.amax(0) + 1
         center = lower + (torch.rand(2, generator=generator) * (upper - lower)).long()
-    top = int(center[0].clamp(size // 2, height - size + size // 2)) - size // 2
-    left = int(center[1].clamp(size // 2, width - size + size // 2)) - size // 2
-    y, x = torch.meshgrid(
-        torch.arange(top, top + size), torch.arange(left, left + size), indexing="ij"
-    )
+    steps = torch.arange(size) * stride
+    top = min(max(int(center[0]) - extent // 2, 0), height - extent)
+    left = min(max(int(center[1]) - extent // 2, 0), width - extent)
+    y, x = torch.meshgrid(top + steps, left + steps, indexing="ij")
     return torch.stack([x, y], dim=-1).flatten(0, 1)
 
 

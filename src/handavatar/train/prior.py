@@ -83,18 +83,21 @@ def sample_points(
 ) -> Float[Tensor, "points 3"]:
     """Half the points uniform in the part boxes, half near the surface (sigma 1 and 4 mm).
 
+    Without gradient and on the CPU. The surface is the sealed one: the cut at the wrist must be learned like the rest.
+
     Source: paper Sec. 3.2 (pre-training), after COAP: box and surface samples.
     """
     num_uniform = count // 2
     boxes = parts.boxes(posed, margin)
     bone = torch.arange(num_uniform) % NUM_BONES
-    lower, upper = boxes.lower[bone] - margin, boxes.upper[bone] + margin
+    lower, upper = boxes.lower.cpu()[bone] - margin, boxes.upper.cpu()[bone] + margin
     local = lower + (upper - lower) * torch.rand(num_uniform, 3, generator=generator)
-    uniform = apply_rigid(posed.world_from_bone[bone], local[:, None])[:, 0]
+    uniform = apply_rigid(posed.world_from_bone.detach().cpu()[bone], local[:, None])[:, 0]
     num_near = count - num_uniform
-    surface = sample_surface(posed.vertices, posed.rig.faces, num_near, generator)
+    sealed = posed.sealed_vertices.detach().cpu()
+    surface = sample_surface(sealed, posed.rig.sealed_faces.cpu(), num_near, generator)
     sigma = torch.where(torch.arange(num_near) % 2 == 0, 0.001, 0.004)[:, None]
-    near = surface.positions(posed.vertices)
+    near = surface.positions(sealed)
     return torch.cat([uniform, near + sigma * torch.randn(num_near, 3, generator=generator)])
 
 
