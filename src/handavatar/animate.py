@@ -70,7 +70,16 @@ def render_motion(options: RenderOptions) -> Path:
         CaptureError: if the motion cannot be read.
         ValueError: for a pass or an edit that does not exist, or a folder that is not empty.
     """
+    for flag, value, least in (
+        ("--size", options.size, 2),
+        ("--frames", 1 if options.frames is None else options.frames, 1),
+        ("--num-samples", options.num_samples, 1),
+    ):
+        if value < least:
+            raise ValueError(f"{flag} {value}: expected at least {least}")
     passes = tuple(word.strip() for word in options.passes.split(",") if word.strip())
+    if not passes:
+        raise ValueError(f"--passes: none given; choose from {', '.join(PASSES)}")
     for name in passes:
         if name not in PASSES:
             raise ValueError(

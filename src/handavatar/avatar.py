@@ -102,6 +102,25 @@ class HandState:
 
 
 @dataclass(frozen=True, eq=False)
+class VisibleSamples:
+    """Samples that weigh something in their ray.
+
+    Attributes:
+        weights: in the ray; with gradient where gradients are enabled.
+        rays: ray of each sample, ascending.
+        depths: metres along the ray.
+        directed: directed soft occupancy, without gradient.
+        neighbours: nearest anchors.
+    """
+
+    weights: Float[Tensor, "kept"]
+    rays: Int[Tensor, "kept"]
+    depths: Float[Tensor, "kept"]
+    directed: Float[Tensor, "kept bones"]
+    neighbours: Neighbours
+
+
+@dataclass(frozen=True, eq=False)
 class RayValues:
     """What each ray sees. Channels that nothing covers are zero.
 
@@ -249,7 +268,31 @@ class HandAvatar(nn.Module):
 
         Source: paper Sec. 3.3, Eq. 2, with Eq. 4 along the same samples.
         """
-        num_rays = len(rays.origins)
+        seen = self.visible_samples(state, rays, settings, generator)
+        albedo, illumination = self._shade(state, seen.neighbours, seen.directed, edit or Edit())
+        values = torch.cat(
+            [
+                albedo * illumination[:, None],
+                albedo,
+                illumination[:, None],
+                seen.neighbours.interpolated(state.anchor_normals),
+                seen.depths[:, None],
+                torch.ones_like(seen.depths)[:, None],
+            ],
+            dim=-1,
+        )
+        total = composite_sparse(seen.weights, seen.rays, values, len(rays.origins))
+        color, albedo, light, normal, depth, alpha = total.split([3, 3, 1, 3, 1, 1], dim=-1)
+        return RayValues(color, albedo, light[:, 0], normal, depth[:, 0], alpha[:, 0])
+
+    def visible_samples(
+        self,
+        state: HandState,
+        rays: Rays,
+        settings: RenderSettings,
+        generator: torch.Generator | None = None,
+    ) -> VisibleSamples:
+        """The samples that weigh something in their ray; see :meth:`render_rays`."""
         boxes = state.codes.boxes
         near, far, is_hit = intervals_through_boxes(
             rays, boxes.bone_from_world, boxes.lower - boxes.margin, boxes.upper + boxes.margin
@@ -257,27 +300,12 @@ class HandAvatar(nn.Module):
         hit = is_hit.nonzero()[:, 0]
         depths = depths_along(near[hit], far[hit], settings.num_samples, generator)
         rays_hit = Rays(rays.origins[hit], rays.directions[hit])
-        weights, kept, directed = self._visible_samples(state, rays_hit, depths, settings)
+        weights, kept, directed = self._weighed(state, rays_hit, depths, settings)
         ray, sample = kept.unbind(-1)
         along = depths[ray, sample]
         points = rays_hit.origins[ray] + along[:, None] * rays_hit.directions[ray]
-
         neighbours = nearest_anchors(state.anchors, points)
-        albedo, illumination = self._shade(state, neighbours, directed, edit or Edit())
-        values = torch.cat(
-            [
-                albedo * illumination[:, None],
-                albedo,
-                illumination[:, None],
-                neighbours.interpolated(state.anchor_normals),
-                along[:, None],
-                torch.ones_like(along)[:, None],
-            ],
-            dim=-1,
-        )
-        total = composite_sparse(weights, hit[ray], values, num_rays)
-        color, albedo, light, normal, depth, alpha = total.split([3, 3, 1, 3, 1, 1], dim=-1)
-        return RayValues(color, albedo, light[:, 0], normal, depth[:, 0], alpha[:, 0])
+        return VisibleSamples(weights, hit[ray], along, directed, neighbours)
 
     def _shade(
         self,
@@ -291,7 +319,7 @@ class HandAvatar(nn.Module):
         light = self.illumination(rotations, neighbours, edit.of_directed(directed))
         return albedo, edit.of_illumination(light)
 
-    def _visible_samples(
+    def _weighed(
         self,
         state: HandState,
         rays: Rays,

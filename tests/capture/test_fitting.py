@@ -8,16 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from handavatar.capture.fitted_hand import HandFit, HandModel, projected
 from handavatar.capture.fitting import (
     FitOptions,
-    HandFit,
-    HandModel,
     Observations,
     fit_hands,
     initial_fit,
     landmark_errors,
     placed,
-    projected,
     refined,
 )
 from handavatar.capture.outlines import (
@@ -25,9 +23,9 @@ from handavatar.capture.outlines import (
     is_behind_wrist,
     mask_outline,
     silhouette,
-    window_camera,
 )
-from handavatar.capture.tracking import LANDMARK_NAMES, Window
+from handavatar.capture.tracking import LANDMARK_NAMES
+from handavatar.capture.windows import Window, window_camera
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import HandPose

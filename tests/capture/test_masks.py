@@ -6,7 +6,7 @@ import torch
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from handavatar.capture.fitting import HandFit, HandModel, projected
+from handavatar.capture.fitted_hand import HandFit, HandModel, projected
 from handavatar.capture.masks import (
     GaussianMixture,
     find_mask,
@@ -15,8 +15,9 @@ from handavatar.capture.masks import (
     oklab_from_srgb,
     pixels_per_metre,
 )
-from handavatar.capture.outlines import silhouette, window_camera
-from handavatar.capture.tracking import TrackedHand, Window
+from handavatar.capture.outlines import silhouette
+from handavatar.capture.tracking import TrackedHand
+from handavatar.capture.windows import Window, window_camera
 from handavatar.geometry.rotations import axis_angle_from_matrix
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose_sampling import gesture_rotations

@@ -13,10 +13,9 @@ from handavatar.capture.tracking import (
     LANDMARK_NAMES,
     HandFinder,
     Sighting,
-    resampled,
     track_hand,
-    window_around,
 )
+from handavatar.capture.windows import resampled, window_around
 
 WIDTH, HEIGHT = 320, 240
 

@@ -14,7 +14,6 @@ from handavatar.field.occupancy import (
     box_fade,
     contains,
     local_points,
-    occupancy_from_logits,
     soft_occupancy,
 )
 from handavatar.geometry.rotations import apply_rigid
@@ -78,10 +77,13 @@ def test_maximum_fusion_agrees_with_equation_1_as_printed(slope: float) -> None:
     """Equation 1 with sigma, and with the soft sigma of equation 3 in its place."""
     logits, slots = _answers()
     found = MaximumFusion().over_pairs(logits, slots, 40, slope)
-    sigma = occupancy_from_logits if slope == 1 else soft_occupancy
     for slot in range(40):
         of_pairs = [logit for logit, s in zip(logits, slots, strict=True) if int(s) == slot]
-        expected = sigma(torch.stack(of_pairs).max()) if of_pairs else torch.zeros(()).double()
+        expected = (
+            soft_occupancy(torch.stack(of_pairs).max(), slope)
+            if of_pairs
+            else torch.zeros(()).double()
+        )
         torch.testing.assert_close(found[slot], expected)
 
 
@@ -105,9 +107,9 @@ def test_softmax_fusion_agrees_with_a_loop() -> None:
 def test_occupancy_is_the_logistic_function_of_the_logit() -> None:
     logits = torch.linspace(-30, 30, 101, dtype=torch.float64)
     expected = torch.tensor([1 / (1 + math.exp(-x)) for x in logits.tolist()]).double()
-    torch.testing.assert_close(occupancy_from_logits(logits), expected)
-    assert float(occupancy_from_logits(torch.tensor(-torch.inf))) == 0
-    assert float(occupancy_from_logits(torch.tensor(0.0))) == 0.5
+    torch.testing.assert_close(soft_occupancy(logits, 1.0), expected)
+    assert float(soft_occupancy(torch.tensor(-torch.inf), 1.0)) == 0
+    assert float(soft_occupancy(torch.tensor(0.0), 1.0)) == 0.5
 
 
 @pytest.mark.parametrize("softness", [0.05, 0.5])
@@ -119,7 +121,7 @@ def test_soft_occupancy_agrees_with_equation_3_as_printed(softness: float) -> No
 
 def test_soft_occupancy_keeps_order_and_surface_and_tells_far_from_near() -> None:
     logits = torch.linspace(-200, 200, 401, dtype=torch.float64)
-    soft, hard = soft_occupancy(logits), occupancy_from_logits(logits)
+    soft, hard = soft_occupancy(logits, 0.05), soft_occupancy(logits, 1.0)
     assert bool((soft[1:] > soft[:-1]).all())
     assert float(soft[200]) == 0.5
     outside = logits < 0

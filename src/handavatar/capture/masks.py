@@ -15,7 +15,8 @@ from PIL import Image, ImageDraw
 from scipy import ndimage
 
 from handavatar.capture.checks import CaptureError
-from handavatar.capture.tracking import TrackedHand, Window
+from handavatar.capture.tracking import TrackedHand
+from handavatar.capture.windows import Window
 
 _FINGER_CHAINS = (
     (0, 1, 2, 3, 4),

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from handavatar.capture.fitting import OutlinePairs
-from handavatar.capture.tracking import Window
+from handavatar.capture.windows import Window
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.hand.rig import Rig
@@ -189,27 +189,6 @@ def is_behind_wrist(
     center = rim.mean(0)
     towards = (hand - center) / (np.linalg.norm(hand - center) + 1e-9)
     return (points - center) @ towards < margin
-
-
-def window_camera(
-    focal: float,
-    picture_size: tuple[int, int],
-    corner: tuple[float, float],
-    side: float,
-    pixels: int,
-) -> Camera:
-    """The camera of a square piece of the picture, resized.
-
-    Args:
-        focal: of the picture, pixels.
-        picture_size: width and height, pixels.
-        corner: upper left corner of the piece, pixels of the picture.
-        side: of the piece, pixels of the picture.
-        pixels: of the result.
-    """
-    scale = pixels / side
-    center = [(size / 2 - start) * scale for size, start in zip(picture_size, corner, strict=True)]
-    return Camera((focal * scale,) * 2, (center[0], center[1]), pixels, pixels, torch.eye(4))
 
 
 def silhouette(

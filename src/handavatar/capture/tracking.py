@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import Image
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import VideoFrame
+from handavatar.capture.windows import Window, resampled, window_around
 
 NUM_LANDMARKS = 21
 LANDMARK_NAMES: tuple[str, ...] = (
@@ -31,43 +31,8 @@ LANDMARK_NAMES: tuple[str, ...] = (
 _TURNS = (math.radians(35), math.radians(-35))
 _VIEW_SIDE = 448
 _VIEW_SCALE = 2.0
-_WINDOW_SCALE = 1.9
-_MAX_WINDOW_SIDE = 448
 _MAX_SHARE_OF_TWO_HANDS = 0.1
 _MIN_FRAMES = 8
-
-
-@dataclass(frozen=True, eq=False)
-class Window:
-    """A square piece of a picture, resampled.
-
-    A point of the picture lies in the window at ``(point - corner) * scale``, both in pixels
-    counted from the corner of the first pixel. Beyond the picture its border is repeated.
-
-    Attributes:
-        image: sRGB.
-        corner: upper left corner (x, y) in the picture.
-        scale: window pixels per picture pixel.
-        picture_size: width and height of the whole picture, pixels.
-    """
-
-    image: UInt8[np.ndarray, "side side 3"]
-    corner: tuple[float, float]
-    scale: float
-    picture_size: tuple[int, int]
-
-    def from_picture(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-        """Picture points in window pixels."""
-        return (points - np.array(self.corner)) * self.scale
-
-    def mirrored(self) -> "Window":
-        """The window of the mirrored picture."""
-        side = self.image.shape[0] / self.scale
-        return replace(
-            self,
-            image=np.ascontiguousarray(self.image[:, ::-1]),
-            corner=(self.picture_size[0] - self.corner[0] - side, self.corner[1]),
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,62 +213,6 @@ def track_hand(
     if side == "left":
         hands = [hand.mirrored() for hand in hands]
     return Track(side, tuple(hands), skipped, picture_size)
-
-
-def resampled(
-    image: UInt8[np.ndarray, "height width 3"],
-    picture_from_view: Float[np.ndarray, "2 2"],
-    corner: Float[np.ndarray, "2"],
-    side: int,
-) -> UInt8[np.ndarray, "side side 3"]:
-    """A square view of a picture; its border is repeated outside. Blurred first where it shrinks.
-
-    Args:
-        image: any picture.
-        picture_from_view: turns and scales view pixels to picture pixels.
-        corner: the view's upper left corner, picture pixels.
-        side: of the view, pixels.
-    """
-    low = np.floor(np.min(_view_corners(picture_from_view, corner, side), axis=0)).astype(int) - 2
-    high = np.ceil(np.max(_view_corners(picture_from_view, corner, side), axis=0)).astype(int) + 2
-    rows = np.clip(np.arange(low[1], high[1]), 0, image.shape[0] - 1)
-    columns = np.clip(np.arange(low[0], high[0]), 0, image.shape[1] - 1)
-    piece = Image.fromarray(image[rows[:, None], columns[None, :]])
-    shrink = math.sqrt(abs(float(np.linalg.det(picture_from_view))))
-    factor = max(1, round(shrink))
-    if factor > 1:
-        piece = piece.reduce(factor)
-    matrix = picture_from_view / factor
-    shift = (corner - low) / factor
-    coefficients = (*matrix[0], shift[0], *matrix[1], shift[1])
-    view = piece.transform(
-        (side, side), Image.Transform.AFFINE, coefficients, Image.Resampling.BILINEAR
-    )
-    return np.asarray(view)
-
-
-def _view_corners(
-    picture_from_view: Float[np.ndarray, "2 2"], corner: Float[np.ndarray, "2"], side: int
-) -> Float[np.ndarray, "4 2"]:
-    square = np.array([[0, 0], [side, 0], [0, side], [side, side]], dtype=float)
-    return square @ picture_from_view.T + corner
-
-
-def window_around(
-    image: UInt8[np.ndarray, "height width 3"], landmarks: Float[np.ndarray, "21 2"]
-) -> Window:
-    """The surroundings of a hand: room for the wrist and for its errors on every side."""
-    low, high = landmarks.min(0), landmarks.max(0)
-    side = float((high - low).max()) * _WINDOW_SCALE
-    pixels = int(min(_MAX_WINDOW_SIDE, max(128, round(side))))
-    corner = (low + high) / 2 - side / 2
-    picture_from_view = np.eye(2) * (side / pixels)
-    return Window(
-        resampled(image, picture_from_view, corner, pixels),
-        (float(corner[0]), float(corner[1])),
-        pixels / side,
-        (image.shape[1], image.shape[0]),
-    )
 
 
 def _combined(finder: HandFinder, frame: VideoFrame, first: Sighting) -> TrackedHand:

@@ -17,10 +17,9 @@ from torch import Tensor
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import video_frames
+from handavatar.capture.fitted_hand import HandFit, HandModel
 from handavatar.capture.fitting import (
     FitOptions,
-    HandFit,
-    HandModel,
     Observations,
     fit_hands,
     landmark_errors,
@@ -33,9 +32,9 @@ from handavatar.capture.outlines import (
     is_behind_wrist,
     mask_outline,
     silhouette,
-    window_camera,
 )
-from handavatar.capture.tracking import Track, TrackedHand, resampled, track_hand
+from handavatar.capture.tracking import Track, TrackedHand, track_hand
+from handavatar.capture.windows import resampled, window_camera
 from handavatar.geometry.cameras import project
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.rig import Rig

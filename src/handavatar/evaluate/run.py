@@ -147,6 +147,9 @@ def _measured(
     is_lpips = isinstance(distance, LpipsVgg)
     if not is_lpips:
         notes.append(f"paper.lpips: null, its weights are not here; {distance.name}: {value:.4f}")
+    truth = _against_truth(capture, frames, renderings)
+    if truth is None:
+        notes.append("truth: null, the capture knows neither albedo nor shading of these frames")
     training = [capture.frame(index) for index in capture.split("train")]
     color = mean_color(
         [frame.image.float() / 255 for frame in training], [frame.mask for frame in training]
@@ -171,7 +174,7 @@ def _measured(
         },
         "mask_iou": mean_mask_iou(judged),
         "baseline": {"mean_color_masked_psnr": baseline},
-        "truth": _against_truth(capture, frames, renderings),
+        "truth": truth,
         "perceptual": distance.name,
         "notes": notes,
     }

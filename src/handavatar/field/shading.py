@@ -61,14 +61,15 @@ class IlluminationField(nn.Module):
 
     def forward(
         self,
-        rotations: Float[Tensor, "bones 3"],
+        rotations: Float[Tensor, "*queries bones 3"],
         neighbours: Neighbours,
         directed: Float[Tensor, "queries bones"],
     ) -> Float[Tensor, "queries"]:
         """Illumination, in (0, 1).
 
         Args:
-            rotations: the whole pose, the wrist's rotation in the world frame.
+            rotations: the whole pose, the wrist's rotation in the world frame; one for all
+                queries or one for each.
             neighbours: nearest anchors of the queries.
             directed: directed soft occupancy at the queries, without gradient.
 
@@ -76,5 +77,5 @@ class IlluminationField(nn.Module):
             light that is fixed in the world stands; here it is the world's.
         """
         places = neighbours.interpolated(self.position_codes)
-        pose = rotations.flatten().expand(len(places), -1)
+        pose = rotations.flatten(-2).expand(len(places), -1)
         return self.mlp(torch.cat([directed, places, pose], dim=-1))[:, 0].sigmoid()

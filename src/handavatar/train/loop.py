@@ -23,6 +23,7 @@ from handavatar.geometry.meshes import is_inside, unique_edges
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.rig import RigError
 from handavatar.render.silhouette import silhouette_loss, soft_silhouette
+from handavatar.train.appearance import SeenSamples, appearance_loss, find_seen_samples
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.losses import color_loss, occupancy_loss, offset_loss
 from handavatar.train.optimizer_state import (
@@ -53,6 +54,10 @@ class Method:
 
     Attributes:
         steps: optimisation steps.
+        warm_steps: the first steps train albedo and illumination alone, on samples of the prior's
+            geometry that are found once (see ``train.appearance``).
+        warm_pixels: pixels per such step, from all frames.
+        warm_stride: such steps know every so-manieth pixel in both directions.
         frames: frames per step.
         patches: patches per frame.
         patch_size: pixels along a side.
@@ -69,6 +74,8 @@ class Method:
         decay: all learning rates fall by this factor until the end, exponentially.
         occupancy_points: labelled points per frame for L_PairOF.
         occupancy_every: L_PairOF is taken at every so many steps.
+        rounds: midpoint subdivisions of the rig's mesh.
+        num_anchors: anchors on the surface.
     """
 
     steps: int
@@ -77,6 +84,9 @@ class Method:
     patch_size: int
     num_samples: int
     silhouette_size: int
+    warm_steps: int = 0
+    warm_pixels: int = 4096
+    warm_stride: int = 4
     patch_strides: tuple[int, ...] = (1,)
     perceptual_weight: float = 1.0
     lr: float = 5e-4
@@ -87,11 +97,14 @@ class Method:
     decay: float = 0.1
     occupancy_points: int = 1024
     occupancy_every: int = 1
+    rounds: int = 2
+    num_anchors: int = 4096
 
 
 METHODS: dict[str, Method] = {
     "quick": Method(
-        steps=400,
+        steps=500,
+        warm_steps=300,
         frames=1,
         patches=1,
         patch_size=32,
@@ -193,12 +206,18 @@ def train(options: TrainOptions) -> Path:
     with locked(run), _stop_signals() as stopped:
         start = _restore(run, training)
         edges = unique_edges(training.avatar.rig.faces)
+        seen = None
         with Progress("train", steps, start) as progress:
             for step in range(start + 1, steps + 1):
                 _set_learning_rates(training.optimizer, method.decay ** ((step - 1) / steps))
-                figures = train_step(
-                    training, frames, edges, perceptual, method, step, options.seed
-                )
+                if step <= method.warm_steps:
+                    seen = seen or _prior_samples(training, frames, method)
+                    figures = warm_step(training, seen, method, step, options.seed)
+                else:
+                    seen = None
+                    figures = train_step(
+                        training, frames, edges, perceptual, method, step, options.seed
+                    )
                 if not all(math.isfinite(value) for value in figures.values()):
                     raise FloatingPointError(
                         f"step {step}: the loss is not finite ({figures}); the last checkpoint in "
@@ -247,7 +266,9 @@ def begin_training(
         "color_space": capture.color_space,
         "licence": capture.licence,
     }
-    avatar = HandAvatar(rig, capture.shape_coefficients, info=info)
+    avatar = HandAvatar(
+        rig, capture.shape_coefficients, method.rounds, method.num_anchors, info=info
+    )
     load_prior(avatar.occupancy, options.prior)
     avatar.start_from_color(
         mean_color(
@@ -273,6 +294,25 @@ def begin_training(
     for group in groups:
         group["initial_lr"] = group["lr"]
     return Training(avatar, corrections, torch.optim.Adam(groups))
+
+
+def _prior_samples(training: Training, frames: list[Frame], method: Method) -> SeenSamples:
+    settings = RenderSettings(num_samples=method.num_samples)
+    return find_seen_samples(training.avatar, frames, settings, method.warm_stride)
+
+
+def warm_step(
+    training: Training, seen: SeenSamples, method: Method, step: int, seed: int
+) -> dict[str, float]:
+    """One optimiser step of albedo and illumination; random numbers from ``(seed, step)``."""
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
+    pixels = torch.randint(len(seen.colors), (method.warm_pixels,), generator=generator)
+    loss, squared = appearance_loss(training.avatar, seen, pixels.to(seen.colors.device))
+    training.optimizer.zero_grad(set_to_none=True)
+    loss.backward()
+    training.optimizer.step()
+    value = float(loss.detach())
+    return {"color": value, "loss": value, "psnr": -10 * math.log10(max(float(squared), 1e-10))}
 
 
 def train_step(

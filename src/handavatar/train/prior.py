@@ -83,7 +83,8 @@ def sample_points(
 ) -> Float[Tensor, "points 3"]:
     """Half the points uniform in the part boxes, half near the surface (sigma 1 and 4 mm).
 
-    Without gradient and on the CPU. The surface is the sealed one: the cut at the wrist must be learned like the rest.
+    Without gradient and on the CPU. The surface is the sealed one: the cut at the wrist must be
+    learned like the rest.
 
     Source: paper Sec. 3.2 (pre-training), after COAP: box and surface samples.
     """

@@ -137,7 +137,7 @@ def create_run(
     """Makes the folder with ``options.json`` and ``run.json``.
 
     Args:
-        folder: must not exist or be empty.
+        folder: must not exist, be empty or hold the beginnings of a start that was killed.
         options: what to train, JSON values only.
         seed: of the training.
         capture: folder of the capture.
@@ -149,7 +149,8 @@ def create_run(
         CheckpointError: if the folder holds something already.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        if not (overwrite and (folder / "run.json").is_file()):
+        is_replaced = overwrite and (folder / "run.json").is_file()
+        if not (is_replaced or _is_unfinished_start(folder)):
             raise CheckpointError(
                 f"{folder}: not empty, expected a new folder\n"
                 "name another with --out, or continue this run with --resume auto"
@@ -170,6 +171,16 @@ def create_run(
     }
     write_json(folder / "run.json", facts)
     return run
+
+
+def _is_unfinished_start(folder: Path) -> bool:
+    """Whether a folder is what :func:`create_run` leaves if it is killed between its files."""
+    if not (folder / "checkpoints").is_dir() or any((folder / "checkpoints").iterdir()):
+        return False
+    return all(
+        path.name in ("checkpoints", "options.json") or path.name.startswith(".tmp-")
+        for path in folder.iterdir()
+    )
 
 
 def open_run(folder: Path) -> Run:

@@ -1,0 +1,111 @@
+"""Appearance alone, on samples that stay: the first steps of a quick training.
+
+As long as the geometry does not move, the samples that each pixel sees, their weights, their
+anchors and what lies before them stay the same. They are found once; then a step costs the two
+small networks and can look at pixels of all frames at once.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from handavatar.avatar import HandAvatar, RenderSettings
+from handavatar.capture.frames import Frame
+from handavatar.field.anchors import Neighbours
+from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
+from handavatar.render.volume import composite_sparse
+from handavatar.train.losses import color_loss
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSamples:
+    """What chosen pixels of all training frames see of a geometry that stays.
+
+    Attributes:
+        weights: of each sample in its pixel.
+        directed: directed soft occupancy at each sample.
+        neighbours: nearest anchors of each sample.
+        frames: frame number of each sample.
+        starts: where each pixel's samples begin; its samples are neighbours in all of the above.
+        colors: true colour of each pixel, in [0, 1].
+        alpha: how much of each pixel the hand covers.
+        rotations: pose of each frame, axis-angle.
+    """
+
+    weights: Float[Tensor, "samples"]
+    directed: Float[Tensor, "samples bones"]
+    neighbours: Neighbours
+    frames: Int[Tensor, "samples"]
+    starts: Int[Tensor, "pixels_and_one"]
+    colors: Float[Tensor, "pixels 3"]
+    alpha: Float[Tensor, "pixels"]
+    rotations: Float[Tensor, "frames bones 3"]
+
+
+@torch.no_grad()
+def find_seen_samples(
+    avatar: HandAvatar, frames: list[Frame], settings: RenderSettings, stride: int
+) -> SeenSamples:
+    """Evaluates every ``stride``-th pixel of the hand, in both directions, of every frame.
+
+    Pixels at the hand's border are left out: what they mix with the background is unknown.
+    """
+    weights, directed, indices, shares, numbers = [], [], [], [], []
+    counts, colors, alphas = [], [], []
+    for number, frame in enumerate(frames):
+        state = avatar.prepare(frame.pose.to(avatar.device))
+        camera = frame.camera.to(avatar.device)
+        grid = torch.zeros_like(frame.mask)
+        grid[number % stride :: stride, (number // stride) % stride :: stride] = True
+        y, x = (frame.mask & grid).nonzero().unbind(-1)
+        rays = rays_through_pixels(camera, pixel_centers(camera)[y, x])
+        seen = avatar.visible_samples(state, rays, settings)
+        alpha = composite_sparse(
+            seen.weights, seen.rays, torch.ones_like(seen.weights)[:, None], len(x)
+        )[:, 0]
+        is_covered = alpha > 0.98
+        is_kept = is_covered[seen.rays]
+        weights.append(seen.weights[is_kept])
+        directed.append(seen.directed[is_kept])
+        indices.append(seen.neighbours.indices[is_kept])
+        shares.append(seen.neighbours.weights[is_kept])
+        numbers.append(torch.full_like(seen.rays[is_kept], number))
+        counts.append(torch.bincount(seen.rays, minlength=len(x))[is_covered])
+        colors.append(frame.image[y, x].to(alpha)[is_covered] / 255)
+        alphas.append(alpha[is_covered])
+    starts = torch.cat(counts).cumsum(0)
+    return SeenSamples(
+        torch.cat(weights),
+        torch.cat(directed),
+        Neighbours(torch.cat(indices), torch.cat(shares)),
+        torch.cat(numbers),
+        torch.cat([torch.zeros_like(starts[:1]), starts]),
+        torch.cat(colors),
+        torch.cat(alphas),
+        torch.stack([frame.pose.rotations for frame in frames]).to(avatar.device),
+    )
+
+
+def appearance_loss(
+    avatar: HandAvatar, seen: SeenSamples, pixels: Int[Tensor, "pixels"]
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Colour loss and mean squared error of some pixels.
+
+    Source: paper Sec. 3.3, the l1 term of L_SelF; same volume rendering as everywhere, with
+        weights that do not move.
+    """
+    begin, count = seen.starts[pixels], seen.starts[pixels + 1] - seen.starts[pixels]
+    ray = torch.arange(len(pixels), device=pixels.device).repeat_interleave(count)
+    first = count.cumsum(0) - count
+    sample = begin[ray] + torch.arange(len(ray), device=pixels.device) - first[ray]
+    neighbours = Neighbours(seen.neighbours.indices[sample], seen.neighbours.weights[sample])
+    albedo = avatar.albedo(neighbours)
+    light = avatar.illumination(
+        seen.rotations[seen.frames[sample]], neighbours, seen.directed[sample]
+    )
+    color = composite_sparse(seen.weights[sample], ray, albedo * light[:, None], len(pixels))
+    color = color / seen.alpha[pixels][:, None]
+    truth = seen.colors[pixels]
+    return color_loss(color, truth), (color.detach() - truth).square().mean()

@@ -1,0 +1,111 @@
+"""What several tests need: a small avatar, and a capture of a few small pictures."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from handavatar.avatar import HandAvatar
+from handavatar.capture.frames import Frame, write_capture
+from handavatar.geometry.cameras import Camera, look_at
+from handavatar.geometry.meshes import vertex_normals
+from handavatar.hand.open_hand import load_open_hand
+from handavatar.hand.pose import NUM_BONES, HandPose
+from handavatar.render.rasterize import interpolate, rasterize
+from handavatar.train.loop import Method
+from handavatar.train.prior import load_prior
+
+TINY = Method(
+    steps=12,
+    frames=1,
+    patches=1,
+    patch_size=16,
+    num_samples=12,
+    silhouette_size=32,
+    lr=5e-3,
+    lr_codes=1e-2,
+    perceptual_weight=0.1,
+    occupancy_points=64,
+    rounds=0,
+    num_anchors=128,
+)
+"""The whole method on a budget of seconds."""
+
+
+def bent_pose(step: int) -> HandPose:
+    """The fingers close a little and the wrist turns a little from step to step."""
+    rotations = torch.zeros(NUM_BONES, 3)
+    rotations[1:13, 2] = 0.12 * step
+    rotations[0] = torch.tensor([0.0, 0.08 * step, 0.05])
+    return HandPose(rotations, torch.tensor([0.0, 0.01, 0.002 * step]))
+
+
+def camera_above(size: int, distance: float = 0.42) -> Camera:
+    """A square camera over the back of the flat hand, which fills most of the picture."""
+    middle = torch.tensor([-0.08, 0.0, 0.0])
+    placed = look_at(
+        middle + torch.tensor([0.02, distance, 0.05]), middle, torch.tensor([-1.0, 0.0, 0.0])
+    )
+    return Camera((1.7 * size, 1.7 * size), (size / 2, size / 2), size, size, placed)
+
+
+def lit_frame(index: int, split: str, confidence: float = 1.0, size: int = 48) -> Frame:
+    """The rasterised open hand, skin-coloured, under one light."""
+    pose, camera = bent_pose(index), camera_above(size)
+    posed = load_open_hand().shaped().posed(pose)
+    faces = posed.rig.faces
+    fragments = rasterize(posed.vertices, faces, camera)
+    normals = interpolate(fragments, faces, vertex_normals(posed.vertices, faces))
+    light = (normals @ torch.tensor([0.3, 0.9, 0.3])).clamp(0, 1) * 0.7 + 0.2
+    color = light[..., None] * torch.tensor([0.9, 0.65, 0.5]) * fragments.mask[..., None]
+    return Frame(
+        name=f"{index:06d}",
+        image=(color * 255).round().to(torch.uint8),
+        mask=fragments.mask,
+        camera=camera,
+        pose=pose,
+        confidence=confidence,
+        split=split,
+        time=index / 30,
+    )
+
+
+def write_tiny_capture(
+    folder: Path, splits: str = "aaabb", confidence: float = 1.0, **header: str
+) -> Path:
+    """A capture of 48 x 48 pictures: ``a`` stands for a training frame, ``b`` for a test frame."""
+    rig = load_open_hand()
+    frames = [
+        lit_frame(index, {"a": "train", "b": "test"}[letter], confidence)
+        for index, letter in enumerate(splits)
+    ]
+    facts = dict(
+        rig_name=rig.name,
+        rig_sha256=rig.sha256,
+        subject="tiny",
+        source="rasterised in a test",
+        licence="CC0-1.0",
+    )
+    write_capture(folder, frames, **(facts | header))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tiny_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three training and two test frames with known poses; read only."""
+    return write_tiny_capture(tmp_path_factory.mktemp("capture") / "tiny")
+
+
+@pytest.fixture(scope="session")
+def small_avatar() -> HandAvatar:
+    """The 778-vertex hand with the shipped prior and random colours; read only."""
+    torch.manual_seed(0)
+    avatar = HandAvatar(
+        load_open_hand("778"), torch.zeros(10), rounds=0, num_anchors=256, info={"side": "right"}
+    )
+    load_prior(avatar.occupancy)
+    with torch.no_grad():  # Colours and shadows that differ from place to place.
+        avatar.albedo.codes.mul_(10)
+        avatar.shape.mlp.output.weight.mul_(100 / math.sqrt(3))
+    return avatar

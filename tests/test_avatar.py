@@ -1,0 +1,378 @@
+"""The avatar: laws of pictures, the slow plain renderer, exact two-pass gradients, broken files."""
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import bent_pose, camera_above
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from handavatar.avatar import (
+    CheckpointError,
+    HandAvatar,
+    HandState,
+    RayValues,
+    Rendering,
+    RenderSettings,
+)
+from handavatar.edit import Edit, bones_named
+from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
+from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.hand.pose import NUM_BONES, HandPose
+from handavatar.render.sampling import depths_along, intervals_through_boxes
+from handavatar.render.volume import composite, visibility
+
+FEW = RenderSettings(num_samples=24)
+EVERYTHING = RenderSettings(
+    num_samples=24, smallest_weight=0.0, stop=0.0, coarse=1, mask_margin=math.inf
+)
+"""Nothing is skipped that could weigh anything."""
+
+
+def _assert_equal(first: Rendering, second: Rendering) -> None:
+    for name, value in vars(first).items():
+        assert torch.equal(value, getattr(second, name)), name
+
+
+@pytest.fixture(scope="module")
+def rendering(small_avatar: HandAvatar) -> Rendering:
+    return small_avatar.render(bent_pose(2), camera_above(24), settings=FEW)
+
+
+# --- pictures -------------------------------------------------------------------------------------
+
+
+def test_rendering_twice_gives_the_same_picture(
+    small_avatar: HandAvatar, rendering: Rendering
+) -> None:
+    _assert_equal(small_avatar.render(bent_pose(2), camera_above(24), settings=FEW), rendering)
+
+
+def test_the_picture_shows_the_hand(small_avatar: HandAvatar, rendering: Rendering) -> None:
+    pose, camera = bent_pose(2), camera_above(24)
+    with torch.no_grad():
+        state = small_avatar.prepare(pose)
+    mesh = small_avatar.near_mesh(state, camera, 0.0)
+    covered = rendering.alpha > 0.5
+    # A pixel of 24 is 5 mm wide: the outline alone holds a quarter of the hand's pixels.
+    assert int((mesh & covered).sum()) / int((mesh | covered).sum()) > 0.75
+    assert float(rendering.alpha.min()) >= 0 and float(rendering.alpha.max()) <= 1 + 1e-5
+    depth = (rendering.depth / rendering.alpha.clamp_min(1e-6))[covered]
+    assert 0.35 < float(depth.min()) < float(depth.max()) < 0.52
+    assert float(rendering.normal.norm(dim=-1).max()) <= 1 + 1e-5
+    # The colour is the product of the two at every sample, not of their sums.
+    product = (
+        rendering.albedo * (rendering.illumination / rendering.alpha.clamp_min(1e-6))[..., None]
+    )
+    assert float((rendering.color - product)[covered].abs().mean()) < 0.05
+
+
+def test_pieces_of_rays_do_not_matter(small_avatar: HandAvatar, rendering: Rendering) -> None:
+    settings = replace(FEW, rays_at_once=50)
+    pieced = small_avatar.render(bent_pose(2), camera_above(24), settings=settings)
+    for name, value in vars(rendering).items():
+        # Matrix products of other sizes round otherwise: as between fast and plain occupancy.
+        torch.testing.assert_close(getattr(pieced, name), value, atol=1e-4, rtol=0)
+
+
+def test_saving_and_loading_changes_nothing(
+    small_avatar: HandAvatar, rendering: Rendering, tmp_path: Path
+) -> None:
+    small_avatar.save(tmp_path / "deep" / "avatar.safetensors")
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["avatar.safetensors"]
+    loaded = HandAvatar.load(tmp_path / "deep" / "avatar.safetensors")
+    assert loaded.info == small_avatar.info and loaded.rounds == small_avatar.rounds
+    assert loaded.base_rig.sha256 == small_avatar.base_rig.sha256
+    _assert_equal(loaded.render(bent_pose(2), camera_above(24), settings=FEW), rendering)
+
+
+def test_moving_hand_and_camera_together_leaves_the_geometry(
+    small_avatar: HandAvatar, rendering: Rendering
+) -> None:
+    here, camera = bent_pose(2), camera_above(24)
+    turn = matrix_from_axis_angle(torch.tensor([0.5, -0.3, 0.8]))
+    shift = torch.tensor([0.1, -0.2, 0.05])
+    with torch.no_grad():
+        world_from_bone = small_avatar.prepare(here).posed.world_from_bone
+        rest_wrist = world_from_bone[0, :3, 3] - here.translation
+    wrist = turn @ matrix_from_axis_angle(here.rotations[0])
+    # theta = log of the composed rotation, by its skew part (the angle is below pi).
+    angle = torch.arccos((wrist.trace() - 1) / 2)
+    skew = torch.stack(
+        [wrist[2, 1] - wrist[1, 2], wrist[0, 2] - wrist[2, 0], wrist[1, 0] - wrist[0, 1]]
+    )
+    rotations = here.rotations.clone()
+    rotations[0] = skew / (2 * angle.sin()) * angle
+    moved_wrist = turn @ (rest_wrist + here.translation) + shift
+    there = HandPose(rotations, moved_wrist - rest_wrist)
+    world_there_from_here = torch.eye(4)
+    world_there_from_here[:3, :3], world_there_from_here[:3, 3] = turn, shift
+    camera_there = replace(
+        camera, camera_from_world=camera.camera_from_world @ torch.linalg.inv(world_there_from_here)
+    )
+    moved = small_avatar.render(there, camera_there, settings=FEW)
+    # Samples stand where they stood to 1e-7 m; where a thin edge is hit, logits (which change by
+    # some thousand per metre and more) differ in the third digit.
+    for name in ("alpha", "albedo", "depth"):
+        difference = (getattr(moved, name) - getattr(rendering, name)).abs()
+        assert float(difference.mean()) < 1e-3, name
+        assert float((difference > 5e-3).float().mean()) < 0.02, name
+
+
+def _looking_away(camera: Camera) -> Camera:
+    turned = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0])) @ camera.camera_from_world
+    return replace(camera, camera_from_world=turned)
+
+
+@pytest.mark.parametrize("margin", [8 / 256, math.inf])
+def test_a_camera_that_looks_away_sees_nothing(small_avatar: HandAvatar, margin: float) -> None:
+    settings = replace(FEW, mask_margin=margin)
+    rendering = small_avatar.render(bent_pose(2), _looking_away(camera_above(8)), settings=settings)
+    for name, value in vars(rendering).items():
+        assert value.shape[:2] == (8, 8) and not bool(value.any()), name
+
+
+@pytest.mark.parametrize("height", [0.0, 0.012, 0.05])
+@pytest.mark.parametrize("margin", [8 / 256, math.inf])
+def test_a_camera_in_or_at_the_hand_gives_finite_pictures(
+    small_avatar: HandAvatar, height: float, margin: float
+) -> None:
+    camera = camera_above(8, distance=max(height, 1e-3))
+    settings = replace(FEW, mask_margin=margin)
+    rendering = small_avatar.render(bent_pose(0), camera, settings=settings)
+    for name, value in vars(rendering).items():
+        assert bool(torch.isfinite(value).all()), name
+    assert 0 <= float(rendering.alpha.min()) <= float(rendering.alpha.max()) <= 1 + 1e-5
+
+
+def test_training_jitter_repeats_with_its_generator(small_avatar: HandAvatar) -> None:
+    rays, state = _rays(camera_above(8)), small_avatar.prepare(bent_pose(1))
+    colors = [
+        small_avatar.render_rays(state, rays, FEW, torch.Generator().manual_seed(seed)).color
+        for seed in (1, 1, 2)
+    ]
+    assert torch.equal(colors[0], colors[1]) and not torch.equal(colors[0], colors[2])
+
+
+def test_an_untrained_avatar_starts_with_the_given_colour(small_avatar: HandAvatar) -> None:
+    torch.manual_seed(1)
+    avatar = HandAvatar(small_avatar.base_rig, torch.zeros(10), rounds=0, num_anchors=64)
+    avatar.occupancy.load_state_dict(small_avatar.occupancy.state_dict())
+    color = torch.tensor([0.5, 0.3, 0.25])
+    avatar.start_from_color(color)
+    rendering = avatar.render(bent_pose(0), camera_above(12), settings=FEW)
+    seen = rendering.color[rendering.alpha > 0.99]
+    torch.testing.assert_close(seen.mean(0), color, atol=0.05, rtol=0)
+
+
+# --- the slow plain renderer ----------------------------------------------------------------------
+
+
+def _rays(camera: Camera) -> Rays:
+    return rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1))
+
+
+def _rendered_plainly(
+    avatar: HandAvatar, state: HandState, rays: Rays, num_samples: int
+) -> RayValues:
+    """Equations 2 to 4 at every sample of every ray, every pair decoded, nothing skipped."""
+    boxes = state.codes.boxes
+    near, far, is_hit = intervals_through_boxes(
+        rays, boxes.bone_from_world, boxes.lower - boxes.margin, boxes.upper + boxes.margin
+    )
+    near, far = torch.where(is_hit, near, 0.1), torch.where(is_hit, far, 0.2)
+    depths = depths_along(near, far, num_samples)
+    points = rays.origins[:, None] + depths[..., None] * rays.directions[:, None]
+    points = points.flatten(0, 1)
+    pieces = [avatar.occupancy.plain(state.codes, piece) for piece in points.split(512)]
+    occupancy = torch.cat([piece[0] for piece in pieces]).view(depths.shape)
+    soft = torch.cat([piece[1] for piece in pieces]).view(*depths.shape, NUM_BONES).detach()
+    met = [soft[:, 0]]
+    for sample in range(1, num_samples):
+        met.append(torch.maximum(met[-1], soft[:, sample]))
+    directed = torch.stack(met, dim=1).flatten(0, 1)
+
+    distances = (points[:, None] - state.anchors).norm(dim=-1)
+    distances, indices = distances.topk(4, largest=False)
+    weights = 1 / distances.clamp_min(1e-5)
+    weights = (weights / weights.sum(-1, keepdim=True))[..., None]
+    albedo = avatar.albedo.mlp((weights * avatar.albedo.codes[indices]).sum(1)).sigmoid()
+    places = (weights * avatar.illumination.position_codes[indices]).sum(1)
+    pose = state.posed.pose.rotations.flatten().expand(len(places), -1)
+    light = avatar.illumination.mlp(torch.cat([directed, places, pose], dim=-1)).sigmoid()
+    normals = (weights * state.anchor_normals[indices]).sum(1)
+    values = torch.cat(
+        [albedo * light, albedo, light, normals, depths.flatten()[:, None], torch.ones_like(light)],
+        dim=-1,
+    )
+    total = composite(visibility(occupancy), values.view(*depths.shape, -1)) * is_hit[:, None]
+    color, albedo, light, normal, depth, alpha = total.split([3, 3, 1, 3, 1, 1], dim=-1)
+    return RayValues(color, albedo, light[:, 0], normal, depth[:, 0], alpha[:, 0])
+
+
+def test_skipping_nothing_equals_the_plain_renderer(small_avatar: HandAvatar) -> None:
+    rays = _rays(camera_above(10))
+    with torch.no_grad():
+        state = small_avatar.prepare(bent_pose(2))
+        found = small_avatar.render_rays(state, rays, EVERYTHING)
+        expected = _rendered_plainly(small_avatar, state, rays, 24)
+    for name, value in vars(expected).items():
+        # Fast and plain occupancies differ by 2e-5 at most (tests/field/test_occupancy.py), and so
+        # does each of the few samples of a ray that are neither empty nor behind the surface.
+        torch.testing.assert_close(getattr(found, name), value, atol=5e-5, rtol=0)
+        assert float((getattr(found, name) - value).abs().mean()) < 1e-6
+
+
+def test_the_default_settings_lose_less_than_can_be_seen(small_avatar: HandAvatar) -> None:
+    """70 dB is an error of 0.08 of the 255 steps of a pixel."""
+    pose, camera = bent_pose(2), camera_above(12)
+    with torch.no_grad():
+        state = small_avatar.prepare(pose)
+        expected = _rendered_plainly(small_avatar, state, _rays(camera), 64)
+        found = small_avatar.render(pose, camera)
+    for name in ("color", "albedo", "alpha"):
+        error = getattr(found, name).flatten(0, 1) - getattr(expected, name).view(144, -1).squeeze(
+            -1
+        )
+        assert -10 * math.log10(float(error.square().mean()) + 1e-12) > 70, name
+
+
+def _scalar(values: RayValues) -> Tensor:
+    generator = torch.Generator().manual_seed(3)
+    return sum(
+        (torch.randn(value.shape, generator=generator) * value).sum()
+        for value in vars(values).values()
+    )
+
+
+def test_the_two_pass_gradient_is_the_whole_gradient(small_avatar: HandAvatar) -> None:
+    """Evaluated first without gradient, then again where it can be seen: nothing is lost."""
+    rays = _rays(camera_above(8))
+    parameters = dict(small_avatar.named_parameters())
+    seen = small_avatar.render_rays(small_avatar.prepare(bent_pose(2)), rays, EVERYTHING)
+    found = torch.autograd.grad(_scalar(seen), list(parameters.values()))
+    state = small_avatar.prepare(bent_pose(2))
+    plain = _rendered_plainly(small_avatar, state, rays, 24)
+    expected = torch.autograd.grad(_scalar(plain), list(parameters.values()))
+    for name, ours, theirs in zip(parameters, found, expected, strict=True):
+        assert float(theirs.norm()) > 0 or name.endswith("bias"), name
+        # float32 through a dozen layers and back; the offsets' common shift has no gradient.
+        assert float((ours - theirs).norm()) <= 1e-4 * float(theirs.norm()) + 1e-6, name
+
+
+# --- edits ----------------------------------------------------------------------------------------
+
+
+def _edited(avatar: HandAvatar, edit: Edit) -> Rendering:
+    return avatar.render(bent_pose(2), camera_above(24), edit, FEW)
+
+
+def test_the_default_edit_changes_nothing(small_avatar: HandAvatar, rendering: Rendering) -> None:
+    _assert_equal(_edited(small_avatar, Edit()), rendering)
+
+
+def test_light_gain_scales_illumination_and_colour(
+    small_avatar: HandAvatar, rendering: Rendering
+) -> None:
+    brighter = _edited(small_avatar, Edit(light_gain=1.5))
+    torch.testing.assert_close(brighter.illumination, 1.5 * rendering.illumination)
+    torch.testing.assert_close(brighter.color, 1.5 * rendering.color)
+    for name in ("albedo", "alpha", "depth", "normal"):
+        assert torch.equal(getattr(brighter, name), getattr(rendering, name))
+
+
+def test_an_albedo_shift_leaves_light_and_geometry(
+    small_avatar: HandAvatar, rendering: Rendering
+) -> None:
+    bluer = _edited(small_avatar, Edit(albedo_shift=(0.0, 0.0, 0.3)))
+    covered = rendering.alpha > 0.5
+    assert float((bluer.albedo - rendering.albedo)[..., 2][covered].min()) > 0
+    assert (
+        float((bluer.albedo / rendering.alpha.clamp_min(1e-6)[..., None])[covered].max()) <= 1.001
+    )
+    for name in ("illumination", "alpha", "depth", "normal"):
+        assert torch.equal(getattr(bluer, name), getattr(rendering, name))
+
+
+def test_lifted_bones_change_the_light_alone(
+    small_avatar: HandAvatar, rendering: Rendering
+) -> None:
+    lifted = _edited(small_avatar, Edit(lifted_bones=bones_named(("index", "thumb"))))
+    assert not torch.equal(lifted.illumination, rendering.illumination)
+    for name in ("albedo", "alpha", "depth", "normal"):
+        assert torch.equal(getattr(lifted, name), getattr(rendering, name))
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def file(small_avatar: HandAvatar, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("avatar") / "avatar.safetensors"
+    small_avatar.save(path)
+    return path
+
+
+@pytest.mark.parametrize("share", [0.0, 0.001, 0.5, 0.999])
+def test_a_file_cut_short_is_refused(file: Path, tmp_path: Path, share: float) -> None:
+    cut = tmp_path / "cut.safetensors"
+    content = file.read_bytes()
+    cut.write_bytes(content[: int(share * len(content))])
+    with pytest.raises(CheckpointError, match=r"cut\.safetensors"):
+        HandAvatar.load(cut)
+
+
+def test_garbage_and_missing_files_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "noise").write_bytes(bytes(range(256)) * 40)
+    with pytest.raises(CheckpointError, match="noise"):
+        HandAvatar.load(tmp_path / "noise")
+    with pytest.raises(CheckpointError, match="no such file"):
+        HandAvatar.load(tmp_path / "nothing")
+
+
+def _rewritten(file: Path, tmp_path: Path, about: object, drop: str = "-") -> Path:
+    tensors = {name: value for name, value in load_file(file).items() if not name.startswith(drop)}
+    path = tmp_path / "other.safetensors"
+    save_file(tensors, path, {"handavatar": json.dumps(about)})
+    return path
+
+
+@pytest.mark.parametrize("about", [None, [], {"schema": 2}, {"schema": 1}, {"schema": 1, "rig": 3}])
+def test_another_schema_is_refused(file: Path, tmp_path: Path, about: object) -> None:
+    with pytest.raises(CheckpointError, match=r"other\.safetensors"):
+        HandAvatar.load(_rewritten(file, tmp_path, about))
+
+
+@pytest.mark.parametrize("drop", ["rig.faces", "avatar.albedo", "avatar.occupancy.encoder"])
+def test_a_file_that_lacks_tensors_is_refused(
+    file: Path, tmp_path: Path, small_avatar: HandAvatar, drop: str
+) -> None:
+    about = {
+        "schema": 1,
+        "rig": "open-hand",
+        "rounds": 0,
+        "margin": small_avatar.occupancy.margin,
+        "softness": small_avatar.occupancy.softness,
+        "info": {},
+    }
+    assert HandAvatar.load(_rewritten(file, tmp_path, about)).rounds == 0
+    with pytest.raises(CheckpointError, match="not a complete avatar"):
+        HandAvatar.load(_rewritten(file, tmp_path, about, drop))
+
+
+def test_a_failed_save_leaves_the_old_file(
+    small_avatar: HandAvatar, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = file.read_bytes()
+
+    def disk_full(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("handavatar.avatar.save_file", disk_full)
+    with pytest.raises(OSError, match="disk full"):
+        small_avatar.save(file)
+    assert file.read_bytes() == before

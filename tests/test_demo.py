@@ -1,0 +1,44 @@
+"""The demonstration, from the shipped capture to the edited picture, on a budget of steps."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import pytest
+from PIL import Image
+
+from handavatar import demo
+from handavatar.avatar import HandAvatar
+from handavatar.demo import DemoOptions, run_demo
+
+
+def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "precious.txt").write_text("mine")
+    with pytest.raises(ValueError, match="not empty"):
+        run_demo(DemoOptions(tmp_path))
+    assert [path.name for path in tmp_path.iterdir()] == ["precious.txt"]
+
+
+@pytest.mark.slow
+def test_the_demonstration_leaves_everything_it_promises(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    evaluate = demo.evaluate_run
+    monkeypatch.setattr(demo, "evaluate_run", lambda o: evaluate(replace(o, max_frames=2)))
+    out = run_demo(DemoOptions(tmp_path / "out", steps=4, frames=2, size=32, device="cpu"))
+    names = {path.name for path in out.iterdir()}
+    promised = {"avatar.safetensors", "metrics.json", "report.html", "novel_poses.mp4", "edits.png"}
+    assert names == promised | {"run"}
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["mask_iou"] > 0.7 and metrics["truth"] is not None
+    with av.open(str(out / "novel_poses.mp4")) as container:
+        assert len(list(container.decode(video=0))) == 2
+    with Image.open(out / "edits.png") as picture:
+        assert picture.size == (5 * 256, 256)
+    HandAvatar.load(out / "avatar.safetensors")
+
+    # Told again, it continues: nothing is left to train.
+    before = (out / "avatar.safetensors").read_bytes()
+    run_demo(DemoOptions(out, steps=4, frames=2, size=32, device="cpu"))
+    assert (out / "avatar.safetensors").read_bytes() == before

@@ -1,0 +1,339 @@
+"""The training loop on a capture of five small pictures: the same methods, seconds of budget."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import TINY, write_tiny_capture
+
+from handavatar.avatar import CheckpointError, HandAvatar
+from handavatar.capture.frames import CaptureError, read_capture
+from handavatar.evaluate.perceptual import perceptual_loss
+from handavatar.geometry.meshes import unique_edges
+from handavatar.hand.rig import RigError
+from handavatar.train import loop
+from handavatar.train.loop import (
+    METHODS,
+    Interrupted,
+    TrainOptions,
+    begin_training,
+    patch_pixels,
+    train,
+    train_step,
+)
+from handavatar.train.runs import latest_checkpoint, load_checkpoint, open_run, read_log
+
+STEPS = 6
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _tiny_method() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(METHODS, "quick", TINY)
+        yield
+
+
+def _options(capture: Path, out: Path, steps: int = STEPS, seed: int = 0) -> TrainOptions:
+    return TrainOptions(
+        capture,
+        out,
+        steps=steps,
+        seed=seed,
+        checkpoint_every=2,
+        device="cpu",
+        perceptual="substitute",
+    )
+
+
+@pytest.fixture(scope="module")
+def whole_run(
+    tiny_capture: Path, tmp_path_factory: pytest.TempPathFactory, _tiny_method: None
+) -> Path:
+    """Trained without interruption; read only."""
+    return train(_options(tiny_capture, tmp_path_factory.mktemp("runs") / "whole"))
+
+
+def _assert_same_end(run: Path, whole_run: Path) -> None:
+    ours, theirs = run / "avatar.safetensors", whole_run / "avatar.safetensors"
+    assert ours.read_bytes() == theirs.read_bytes()
+    assert read_log(open_run(run)) == read_log(open_run(whole_run))
+    ends = [latest_checkpoint(open_run(folder)) for folder in (run, whole_run)]
+    for name in ("model.safetensors", "optimizer.safetensors"):
+        first, second = ((end.folder / name).read_bytes() for end in ends if end is not None)
+        assert first == second, name
+
+
+# --- what training does ---------------------------------------------------------------------------
+
+
+def test_the_loss_of_a_patch_seen_again_and_again_falls(tiny_capture: Path) -> None:
+    capture = read_capture(tiny_capture)
+    frame = capture.frame(0)
+    training = begin_training(capture, [frame], TINY, _options(tiny_capture, Path("-")))
+    edges = unique_edges(training.avatar.rig.faces)
+    perceptual = perceptual_loss("substitute")
+    # All randomness comes from the step: the same one shows the same patch.
+    figures = [
+        train_step(training, [frame], edges, perceptual, TINY, step=1, seed=0) for _ in range(12)
+    ]
+    for name in ("loss", "color"):
+        assert figures[-1][name] < figures[0][name], name
+    assert figures[-1]["color"] < 0.7 * figures[0]["color"]
+    assert figures[-1]["psnr"] > figures[0]["psnr"] + 2
+
+
+def test_a_step_changes_all_but_the_frozen_encoder(tiny_capture: Path) -> None:
+    capture = read_capture(tiny_capture)
+    frames = [capture.frame(0)]
+    training = begin_training(capture, frames, TINY, _options(tiny_capture, Path("-")))
+    avatar = training.avatar
+    before = {name: value.clone() for name, value in avatar.state_dict().items()}
+    edges = unique_edges(avatar.rig.faces)
+    train_step(training, frames, edges, perceptual_loss("substitute"), TINY, 1, seed=0)
+    changed = {n for n, value in avatar.state_dict().items() if not torch.equal(value, before[n])}
+    fixed = {name for name in before if name.startswith("occupancy.encoder")}
+    fixed |= {"coefficients", "anchor_corners", "anchor_barycentric"}
+    fixed |= {"illumination.position_codes"}
+    assert not changed & fixed
+    for part in ("shape", "occupancy.decoder", "albedo.codes", "albedo.mlp", "illumination.mlp"):
+        assert any(name.startswith(part) for name in changed), part
+
+
+def test_the_run_folder_holds_everything(whole_run: Path, tiny_capture: Path) -> None:
+    names = {path.name for path in whole_run.iterdir()}
+    assert {"options.json", "run.json", "log.jsonl", "checkpoints", "avatar.safetensors"} <= names
+    kept = sorted(path.name for path in (whole_run / "checkpoints").iterdir())
+    assert kept == ["step-000000002", "step-000000004", "step-000000006"]
+    run = open_run(whole_run)
+    assert [record["step"] for record in read_log(run)] == list(range(1, STEPS + 1))
+    assert {"loss", "psnr", "color", "silhouette", "occupancy"} <= read_log(run)[0].keys()
+    assert run.facts["capture"]["sha256"] == read_capture(tiny_capture).sha256
+    assert run.facts["perceptual"] == perceptual_loss("substitute").name
+    assert run.options["steps"] == STEPS and run.options["budget"]["patch_size"] == 16
+    info = HandAvatar.load(run.avatar).info
+    assert info["subject"] == "tiny" and info["side"] == "right"
+    assert {"camera_from_world", "rotations", "translation"} == info["view"].keys()
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(
+    tiny_capture: Path, tmp_path: Path
+) -> None:
+    runs = [
+        train(_options(tiny_capture, tmp_path / str(index), steps=2, seed=seed))
+        for index, seed in enumerate((3, 3, 4))
+    ]
+    first, second, third = ((run / "avatar.safetensors").read_bytes() for run in runs)
+    assert first == second != third
+
+
+def test_tracked_poses_are_corrected_and_known_ones_are_not(
+    tiny_capture: Path, whole_run: Path, tmp_path: Path
+) -> None:
+    capture = write_tiny_capture(tmp_path / "tracked", "ab", confidence=0.8)
+    run = open_run(train(_options(capture, tmp_path / "run", steps=2)))
+    checkpoint = latest_checkpoint(run)
+    assert checkpoint is not None
+    model = load_checkpoint(checkpoint).tensors["model"]
+    assert model["corrections.rotations"].shape == (1, 16, 3)
+    assert bool(model["corrections.rotations"].any() & model["corrections.translations"].any())
+    assert "pose" in read_log(run)[0]
+    known = latest_checkpoint(open_run(whole_run))
+    assert known is not None
+    names = load_checkpoint(known).tensors["model"]
+    assert not any(name.startswith("corrections.") for name in names)
+
+
+# --- interruptions --------------------------------------------------------------------------------
+
+KILLED = """
+import json, os, signal, sys, time
+from pathlib import Path
+from handavatar.train.loop import METHODS, Method, TrainOptions, train
+
+method, capture, run, steps, moments = json.loads(sys.argv[1])
+METHODS["quick"] = Method(**{k: tuple(v) if isinstance(v, list) else v for k, v in method.items()})
+options = TrainOptions(Path(capture), Path(run), steps=steps, checkpoint_every=2, device="cpu",
+                       perceptual="substitute")
+log = Path(run, "log.jsonl")
+count = lambda: log.read_bytes().count(b"\\n") if log.exists() else 0
+for lines, later in moments:
+    pid = os.fork()
+    if pid == 0:
+        train(options)
+        os._exit(0)
+    while count() < lines:
+        time.sleep(0.001)
+    time.sleep(later)
+    os.kill(pid, signal.SIGKILL)
+    _, status = os.waitpid(pid, 0)
+    print("killed" if os.WIFSIGNALED(status) else "ended", count())
+train(options)
+"""
+"""Imports once; every training is a fork of its own, killed at a moment the test draws."""
+
+
+def test_killed_at_random_moments_and_resumed_gives_the_same_weights_bit_by_bit(
+    tiny_capture: Path, whole_run: Path, tmp_path: Path
+) -> None:
+    draw = torch.rand(3, generator=torch.Generator().manual_seed(7)).tolist()
+    # After lines 2 and 4 of the log a checkpoint is written. The second run ends with four lines
+    # or more, so that the third is killed while it starts.
+    moments = [(lines, 0.15 * share) for lines, share in zip((2, 4, 4), draw, strict=True)]
+    arguments = [asdict(TINY), str(tiny_capture), str(tmp_path / "run"), STEPS, moments]
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED, json.dumps(arguments)],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        env={**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads())},
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("killed") >= 2, done.stdout
+    _assert_same_end(tmp_path / "run", whole_run)
+
+
+def test_a_kill_before_the_first_line_of_the_run_is_no_obstacle(
+    tiny_capture: Path, tmp_path: Path
+) -> None:
+    """What :func:`create_run` leaves if it is killed between its files."""
+    run = tmp_path / "run"
+    (run / "checkpoints").mkdir(parents=True)
+    (run / "options.json").write_text("{}")
+    (run / ".tmp-123-run.json").write_text("{")
+    train(_options(tiny_capture, run, steps=1))
+    assert (run / "avatar.safetensors").is_file()
+
+
+def test_an_interrupt_saves_and_the_rest_continues(
+    tiny_capture: Path, whole_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append = loop.append_log
+    handler = signal.getsignal(signal.SIGINT)
+
+    def interrupting(run: object, step: int, record: dict[str, float]) -> None:
+        append(run, step, record)
+        if step == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(loop, "append_log", interrupting)
+    options = _options(tiny_capture, tmp_path / "run")
+    with pytest.raises(Interrupted, match="step 3"):
+        train(options)
+    assert signal.getsignal(signal.SIGINT) is handler
+    checkpoint = latest_checkpoint(open_run(tmp_path / "run"))
+    assert checkpoint is not None and checkpoint.step == 3
+    assert not (tmp_path / "run" / "avatar.safetensors").exists()
+    monkeypatch.setattr(loop, "append_log", append)
+    train(options)
+    _assert_same_end(tmp_path / "run", whole_run)
+
+
+def test_a_checkpoint_cut_in_half_falls_back_to_the_one_before(
+    tiny_capture: Path, whole_run: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole_run, run)
+    (run / "avatar.safetensors").unlink()
+    newest = run / "checkpoints" / "step-000000006" / "model.safetensors"
+    newest.write_bytes(newest.read_bytes()[: newest.stat().st_size // 2])
+    train(_options(tiny_capture, run))
+    assert (run / "corrupt" / "step-000000006").is_dir()
+    _assert_same_end(run, whole_run)
+
+
+def test_a_finished_run_is_not_trained_again(
+    tiny_capture: Path, whole_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole_run, run)
+    monkeypatch.setattr(loop, "train_step", None)
+    train(_options(tiny_capture, run))
+    _assert_same_end(run, whole_run)
+    with pytest.raises(CheckpointError, match="not empty"):
+        train(replace(_options(tiny_capture, run), resume="never"))
+
+
+def test_a_loss_that_is_not_finite_ends_the_run_and_keeps_the_checkpoint(
+    tiny_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def diverging(*arguments: object) -> dict[str, float]:
+        step = arguments[5]
+        return {"loss": float("nan") if step == 3 else 1.0, "psnr": 10.0}
+
+    monkeypatch.setattr(loop, "train_step", diverging)
+    with pytest.raises(FloatingPointError, match="step 3"):
+        train(_options(tiny_capture, tmp_path / "run"))
+    checkpoint = latest_checkpoint(open_run(tmp_path / "run"))
+    assert checkpoint is not None and checkpoint.step == 2
+    assert not (tmp_path / "run" / "avatar.safetensors").exists()
+
+
+# --- bad input ------------------------------------------------------------------------------------
+
+
+def test_a_capture_without_training_frames_is_refused(tmp_path: Path) -> None:
+    capture = write_tiny_capture(tmp_path / "capture", "bb")
+    with pytest.raises(CaptureError, match="train"):
+        train(_options(capture, tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_capture_of_another_rig_is_refused(tmp_path: Path) -> None:
+    capture = write_tiny_capture(tmp_path / "capture", "a", rig_sha256="f" * 64)
+    with pytest.raises(RigError, match="ffffffffffff"):
+        train(_options(capture, tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_missing_prior_is_refused(tiny_capture: Path, tmp_path: Path) -> None:
+    options = replace(_options(tiny_capture, tmp_path / "run"), prior=tmp_path / "none")
+    with pytest.raises(CheckpointError, match="no occupancy prior"):
+        train(options)
+    assert not (tmp_path / "run").exists()
+
+
+def test_pictures_smaller_than_a_patch_are_refused(tiny_capture: Path, tmp_path: Path) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(METHODS, "quick", replace(TINY, patch_size=49))
+        with pytest.raises(CaptureError, match="smaller than a 49 x 49 patch"):
+            train(_options(tiny_capture, tmp_path / "run"))
+
+
+# --- patches and frames ---------------------------------------------------------------------------
+
+
+def test_patches_are_square_grids_inside_the_picture_and_mostly_on_the_hand() -> None:
+    mask = torch.zeros(40, 60, dtype=torch.bool)
+    mask[:3, 50:] = True  # In a corner: centres there must be moved inwards.
+    generator = torch.Generator().manual_seed(0)
+    strides, on_hand = set(), 0
+    for _ in range(100):
+        x, y = patch_pixels(mask, 8, (1, 2, 5, 9), generator).unbind(-1)
+        stride = int(x[1] - x[0])
+        strides.add(stride)
+        assert int(x.min()) >= 0 and int(x.max()) < 60 and int(y.min()) >= 0 and int(y.max()) < 40
+        assert torch.equal(x.view(8, 8)[0] - x[0], stride * torch.arange(8))
+        assert torch.equal(x.view(8, 8), x[:8].expand(8, 8))
+        assert torch.equal(y.view(8, 8), y.view(8, 8)[:, :1].expand(8, 8))
+        assert torch.equal(y.view(8, 8)[:, 0] - y[0], stride * torch.arange(8))
+        on_hand += bool(mask[y, x].any())
+    assert strides == {1, 2, 5}  # 9 does not fit.
+    assert on_hand > 90
+
+
+def test_an_empty_mask_gives_the_middle() -> None:
+    pixels = patch_pixels(torch.zeros(9, 9, dtype=torch.bool), 3, (1,), torch.Generator())
+    assert pixels.tolist()[4] == [4, 4]
+
+
+def test_every_epoch_shows_every_frame_once_in_another_order() -> None:
+    epochs = [[loop._frame_number(7, 7 * epoch + i, seed=1) for i in range(7)] for epoch in (0, 1)]
+    assert sorted(epochs[0]) == sorted(epochs[1]) == list(range(7)) and epochs[0] != epochs[1]

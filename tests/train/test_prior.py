@@ -1,0 +1,103 @@
+"""Pre-training of the occupancy prior: a few steps run, repeat, and refuse broken files."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
+
+from handavatar.avatar import CheckpointError
+from handavatar.field.occupancy import PairOccupancy
+from handavatar.geometry.meshes import is_inside
+from handavatar.hand.open_hand import load_open_hand
+from handavatar.hand.parts import divide_into_parts
+from handavatar.hand.pose import NUM_BONES
+from handavatar.train.prior import (
+    SHIPPED_PRIOR,
+    PriorEvaluationOptions,
+    PriorOptions,
+    evaluate_prior,
+    intersection_over_union,
+    labelled_pose,
+    load_prior,
+    train_prior,
+)
+
+
+def _options(out: Path) -> PriorOptions:
+    return PriorOptions(out, steps=4, points=128, pool=2, refresh=2, level="778", rounds=0)
+
+
+def test_training_repeats_with_its_seed_and_writes_what_it_returns(tmp_path: Path) -> None:
+    reported: list[int] = []
+    fields = [
+        train_prior(options, lambda step, figures: reported.append(step))
+        for options in (
+            _options(tmp_path / "a"),
+            _options(tmp_path / "b"),
+            replace(_options(tmp_path / "c"), seed=1),
+        )
+    ]
+    states = [field.state_dict() for field in fields]
+    assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
+    assert not all(torch.equal(states[0][name], states[2][name]) for name in states[0])
+    assert reported == [4, 4, 4]
+    loaded = PairOccupancy()
+    load_prior(loaded, tmp_path / "a")
+    assert all(torch.equal(value, states[0][name]) for name, value in loaded.state_dict().items())
+    with safe_open(tmp_path / "a", framework="pt") as file:
+        metadata = file.metadata()
+    assert metadata["step"] == "4" and metadata["rig_sha256"] == load_open_hand("778").sha256
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "c"]
+
+
+def test_training_continues_from_a_prior(tmp_path: Path) -> None:
+    options = replace(
+        _options(tmp_path / "on"), steps=1, lr=1e-9, final_lr=1e-9, start=SHIPPED_PRIOR
+    )
+    field, shipped = train_prior(options), load_file(SHIPPED_PRIOR)
+    # One step of Adam moves every weight by at most the learning rate.
+    for name, value in field.state_dict().items():
+        torch.testing.assert_close(value, shipped[name], atol=1e-7, rtol=0)
+
+
+def test_labelled_points_lie_about_the_hand_and_their_labels_are_true() -> None:
+    rig = load_open_hand("778")
+    parts = divide_into_parts(rig)
+    generator = torch.Generator().manual_seed(0)
+    sample = labelled_pose(rig, parts, torch.zeros(NUM_BONES, 3), 400, 0.012, generator)
+    vertices = sample.posed.sealed_vertices
+    assert torch.equal(sample.is_inside, is_inside(vertices, rig.sealed_faces, sample.points))
+    assert 0.1 < float(sample.is_inside.float().mean()) < 0.7
+    distances = torch.cdist(sample.points, vertices).amin(1)
+    assert float(distances.max()) < 0.06
+    # Half lie near the surface: 4 mm at most of noise, and vertices some 5 mm apart.
+    assert float((distances[200:] < 0.02).float().mean()) > 0.95
+
+
+def test_intersection_over_union() -> None:
+    a, b = torch.tensor([1, 1, 0, 0]).bool(), torch.tensor([1, 0, 1, 0]).bool()
+    assert intersection_over_union(a, b) == pytest.approx(1 / 3)
+    assert intersection_over_union(a, a) == 1
+    assert intersection_over_union(~(a | ~a), ~(a | ~a)) == 1
+
+
+def test_broken_priors_are_refused(tmp_path: Path) -> None:
+    content = SHIPPED_PRIOR.read_bytes()
+    (tmp_path / "cut").write_bytes(content[: len(content) // 2])
+    (tmp_path / "noise").write_bytes(b"no weights at all" * 100)
+    save_file({"encoder.input.weight": torch.zeros(2, 2)}, tmp_path / "other")
+    with pytest.raises(CheckpointError, match="no occupancy prior"):
+        load_prior(PairOccupancy(), tmp_path / "missing")
+    for name in ("cut", "noise", "other"):
+        with pytest.raises(CheckpointError, match=f"{name} is not a usable occupancy prior"):
+            load_prior(PairOccupancy(), tmp_path / name)
+
+
+def test_the_shipped_prior_knows_poses_it_never_saw() -> None:
+    """Four poses say little more than that it is no other file; the figure takes fifty."""
+    scores = evaluate_prior(PriorEvaluationOptions(poses=4, points=2048))
+    assert scores["iou"] >= 0.85
+    assert scores["iou"] == pytest.approx((scores["iou_boxes"] + scores["iou_surface"]) / 2)
