@@ -20,7 +20,13 @@ from torch import Tensor, nn
 from handavatar.edit import Edit
 from handavatar.field.anchors import Neighbours, nearest_anchors, place_anchors
 from handavatar.field.occupancy import HandCodes, PairItems, PairOccupancy
-from handavatar.field.shading import AlbedoField, IlluminationField, directed_occupancy
+from handavatar.field.shading import (
+    AlbedoField,
+    IlluminationField,
+    OrientedCues,
+    PaperCues,
+    directed_occupancy,
+)
 from handavatar.field.shape import ShapeOffsets, personal_hand
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
@@ -170,6 +176,7 @@ class HandAvatar(nn.Module):
         rounds: int = 2,
         num_anchors: int = 4096,
         anchors: SurfacePoints | None = None,
+        cues: PaperCues | OrientedCues | None = None,
         info: dict[str, Any] | None = None,
     ) -> None:
         """An untrained avatar.
@@ -180,6 +187,7 @@ class HandAvatar(nn.Module):
             rounds: midpoint subdivisions (the paper's two).
             num_anchors: the paper's N^a.
             anchors: anchors to use instead of placing new ones (when loading).
+            cues: what the illumination depends on; by default the paper's.
             info: facts that travel with the avatar (side, subject, method, ...).
         """
         super().__init__()
@@ -195,7 +203,9 @@ class HandAvatar(nn.Module):
         self.shape = ShapeOffsets()
         self.occupancy = PairOccupancy()
         self.albedo = AlbedoField(len(anchors.faces))
-        self.illumination = IlluminationField(anchors.positions(self.rig.template_vertices))
+        self.illumination = IlluminationField(
+            anchors.positions(self.rig.template_vertices), cues or PaperCues()
+        )
 
     @property
     def device(self) -> torch.device:
@@ -269,13 +279,23 @@ class HandAvatar(nn.Module):
         Source: paper Sec. 3.3, Eq. 2, with Eq. 4 along the same samples.
         """
         seen = self.visible_samples(state, rays, settings, generator)
-        albedo, illumination = self._shade(state, seen.neighbours, seen.directed, edit or Edit())
+        edit = edit or Edit()
+        normals = seen.neighbours.interpolated(state.anchor_normals)
+        albedo = edit.of_albedo(self.albedo(seen.neighbours))
+        illumination = edit.of_illumination(
+            self.illumination(
+                state.posed.pose.rotations,
+                seen.neighbours,
+                edit.of_directed(seen.directed),
+                normals,
+            )
+        )
         values = torch.cat(
             [
                 albedo * illumination[:, None],
                 albedo,
                 illumination[:, None],
-                seen.neighbours.interpolated(state.anchor_normals),
+                normals,
                 seen.depths[:, None],
                 torch.ones_like(seen.depths)[:, None],
             ],
@@ -306,18 +326,6 @@ class HandAvatar(nn.Module):
         points = rays_hit.origins[ray] + along[:, None] * rays_hit.directions[ray]
         neighbours = nearest_anchors(state.anchors, points)
         return VisibleSamples(weights, hit[ray], along, directed, neighbours)
-
-    def _shade(
-        self,
-        state: HandState,
-        neighbours: Neighbours,
-        directed: Float[Tensor, "queries bones"],
-        edit: Edit,
-    ) -> tuple[Float[Tensor, "queries 3"], Float[Tensor, "queries"]]:
-        albedo = edit.of_albedo(self.albedo(neighbours))
-        rotations = state.posed.pose.rotations
-        light = self.illumination(rotations, neighbours, edit.of_directed(directed))
-        return albedo, edit.of_illumination(light)
 
     def _weighed(
         self,
@@ -458,6 +466,7 @@ class HandAvatar(nn.Module):
             "rounds": self.rounds,
             "margin": self.occupancy.margin,
             "softness": self.occupancy.softness,
+            "cues": self.illumination.chosen.name,
             "info": self.info,
         }
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -500,6 +509,7 @@ class HandAvatar(nn.Module):
                 state["coefficients"],
                 rounds=about["rounds"],
                 anchors=anchors,
+                cues={part.name: part for part in (PaperCues(), OrientedCues())}[about["cues"]],
                 info=about["info"],
             )
             avatar.occupancy.margin = about["margin"]

@@ -27,6 +27,7 @@ class SeenSamples:
         weights: of each sample in its pixel.
         directed: directed soft occupancy at each sample.
         neighbours: nearest anchors of each sample.
+        normals: world normal at each sample.
         frames: frame number of each sample.
         starts: where each pixel's samples begin; its samples are neighbours in all of the above.
         colors: true colour of each pixel, in [0, 1].
@@ -37,6 +38,7 @@ class SeenSamples:
     weights: Float[Tensor, "samples"]
     directed: Float[Tensor, "samples bones"]
     neighbours: Neighbours
+    normals: Float[Tensor, "samples 3"]
     frames: Int[Tensor, "samples"]
     starts: Int[Tensor, "pixels_and_one"]
     colors: Float[Tensor, "pixels 3"]
@@ -52,7 +54,7 @@ def find_seen_samples(
 
     Pixels at the hand's border are left out: what they mix with the background is unknown.
     """
-    weights, directed, indices, shares, numbers = [], [], [], [], []
+    weights, directed, indices, shares, normals, numbers = [], [], [], [], [], []
     counts, colors, alphas = [], [], []
     for number, frame in enumerate(frames):
         state = avatar.prepare(frame.pose.to(avatar.device))
@@ -71,6 +73,7 @@ def find_seen_samples(
         directed.append(seen.directed[is_kept])
         indices.append(seen.neighbours.indices[is_kept])
         shares.append(seen.neighbours.weights[is_kept])
+        normals.append(seen.neighbours.interpolated(state.anchor_normals)[is_kept])
         numbers.append(torch.full_like(seen.rays[is_kept], number))
         counts.append(torch.bincount(seen.rays, minlength=len(x))[is_covered])
         colors.append(frame.image[y, x].to(alpha)[is_covered] / 255)
@@ -80,6 +83,7 @@ def find_seen_samples(
         torch.cat(weights),
         torch.cat(directed),
         Neighbours(torch.cat(indices), torch.cat(shares)),
+        torch.cat(normals),
         torch.cat(numbers),
         torch.cat([torch.zeros_like(starts[:1]), starts]),
         torch.cat(colors),
@@ -103,7 +107,10 @@ def appearance_loss(
     neighbours = Neighbours(seen.neighbours.indices[sample], seen.neighbours.weights[sample])
     albedo = avatar.albedo(neighbours)
     light = avatar.illumination(
-        seen.rotations[seen.frames[sample]], neighbours, seen.directed[sample]
+        seen.rotations[seen.frames[sample]],
+        neighbours,
+        seen.directed[sample],
+        seen.normals[sample],
     )
     color = composite_sparse(seen.weights[sample], ray, albedo * light[:, None], len(pixels))
     color = color / seen.alpha[pixels][:, None]

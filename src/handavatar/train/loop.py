@@ -5,7 +5,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
 from handavatar.capture.view import view_of
 from handavatar.evaluate.metrics import mean_color
 from handavatar.evaluate.perceptual import PerceptualLoss, perceptual_loss
+from handavatar.field.shading import OrientedCues, PaperCues
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside, unique_edges
 from handavatar.hand.open_hand import load_open_hand
@@ -54,6 +55,7 @@ class Method:
 
     Attributes:
         steps: optimisation steps.
+        cues: what the illumination depends on: the paper's inputs, or these and the normal.
         warm_steps: the first steps train albedo and illumination alone, on samples of the prior's
             geometry that are found once (see ``train.appearance``).
         warm_pixels: pixels per such step, from all frames.
@@ -84,9 +86,10 @@ class Method:
     patch_size: int
     num_samples: int
     silhouette_size: int
+    cues: PaperCues | OrientedCues = field(default_factory=PaperCues)
     warm_steps: int = 0
-    warm_pixels: int = 4096
-    warm_stride: int = 4
+    warm_pixels: int = 3072
+    warm_stride: int = 5
     patch_strides: tuple[int, ...] = (1,)
     perceptual_weight: float = 1.0
     lr: float = 5e-4
@@ -103,8 +106,9 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "quick": Method(
-        steps=500,
-        warm_steps=300,
+        steps=450,
+        cues=OrientedCues(),
+        warm_steps=250,
         frames=1,
         patches=1,
         patch_size=32,
@@ -487,7 +491,8 @@ def _open_or_create(options: TrainOptions, capture: Capture, perceptual: str, st
         name: str(value) if isinstance(value, Path) else value
         for name, value in asdict(options).items()
     }
-    record |= {"steps": steps, "budget": asdict(METHODS[options.method])}
+    budget = asdict(METHODS[options.method])
+    record |= {"steps": steps, "budget": budget | {"cues": METHODS[options.method].cues.name}}
     return create_run(
         folder,
         record,
