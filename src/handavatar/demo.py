@@ -45,8 +45,8 @@ class DemoOptions:
 def run_demo(options: DemoOptions) -> Path:
     """Trains on the shipped capture, judges held-out poses, renders new ones, edits one.
 
-    Leaves ``avatar.safetensors``, ``metrics.json``, ``report.html``, ``novel_poses.mp4``,
-    ``edits.png`` and the run itself in ``options.out``.
+    Leaves ``avatar.safetensors``, ``metrics.json``, ``report.html``, ``overview.png``,
+    ``novel_poses.mp4``, ``edits.png`` and the run itself in ``options.out``.
 
     Returns:
         The folder.
@@ -72,6 +72,7 @@ def run_demo(options: DemoOptions) -> Path:
     metrics = evaluate_run(EvaluateOptions(run=run, device=options.device))
     shutil.copyfile(run / "evaluation" / "metrics.json", out / "metrics.json")
     shutil.copyfile(run / "evaluation" / "report.html", out / "report.html")
+    Image.fromarray(overview(run / "evaluation")).save(out / "overview.png")
     _say("3/4 a video of poses it never saw", begin)
     renders = run / "renders" / "novel_poses"
     render_motion(
@@ -95,6 +96,14 @@ def run_demo(options: DemoOptions) -> Path:
         begin,
     )
     return out
+
+
+def overview(evaluation: Path, count: int = 4) -> np.ndarray:
+    """Some judged frames, one below the other: truth, rendering, albedo, illumination, normal."""
+    strips = sorted(evaluation.glob("[0-9]*.png"))
+    chosen = [strips[place] for place in np.linspace(0, len(strips) - 1, count).astype(int)]
+    pictures = [np.asarray(Image.open(strip)) for strip in chosen]
+    return np.concatenate([strip[:, : strip.shape[1] * 5 // 6] for strip in pictures], axis=0)
 
 
 def edited_pictures(avatar: HandAvatar) -> np.ndarray:

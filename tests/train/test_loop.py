@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -156,10 +156,12 @@ def test_tracked_poses_are_corrected_and_known_ones_are_not(
 KILLED = """
 import json, os, signal, sys, time
 from pathlib import Path
-from handavatar.train.loop import METHODS, Method, TrainOptions, train
+tests, capture, run, steps, moments = json.loads(sys.argv[1])
+sys.path.insert(0, tests)
+from conftest import TINY
+from handavatar.train.loop import METHODS, TrainOptions, train
 
-method, capture, run, steps, moments = json.loads(sys.argv[1])
-METHODS["quick"] = Method(**{k: tuple(v) if isinstance(v, list) else v for k, v in method.items()})
+METHODS["quick"] = TINY
 options = TrainOptions(Path(capture), Path(run), steps=steps, checkpoint_every=2, device="cpu",
                        perceptual="substitute")
 log = Path(run, "log.jsonl")
@@ -187,7 +189,8 @@ def test_killed_at_random_moments_and_resumed_gives_the_same_weights_bit_by_bit(
     # After lines 2 and 4 of the log a checkpoint is written. The second run ends with four lines
     # or more, so that the third is killed while it starts.
     moments = [(lines, 0.15 * share) for lines, share in zip((2, 4, 4), draw, strict=True)]
-    arguments = [asdict(TINY), str(tiny_capture), str(tmp_path / "run"), STEPS, moments]
+    tests = Path(__file__).parent.parent
+    arguments = [str(tests), str(tiny_capture), str(tmp_path / "run"), STEPS, moments]
     done = subprocess.run(
         [sys.executable, "-c", KILLED, json.dumps(arguments)],
         capture_output=True,
