@@ -18,6 +18,9 @@ from handavatar.train.prior import load_prior
 
 TINY = Method(
     steps=12,
+    warm_steps=3,
+    warm_pixels=64,
+    warm_stride=2,
     frames=1,
     patches=1,
     patch_size=16,

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import bent_pose, camera_above
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -20,6 +21,7 @@ from handavatar.avatar import (
     RenderSettings,
 )
 from handavatar.edit import Edit, bones_named
+from handavatar.field.shading import OrientedCues
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import NUM_BONES, HandPose
@@ -88,6 +90,21 @@ def test_saving_and_loading_changes_nothing(
     assert loaded.info == small_avatar.info and loaded.rounds == small_avatar.rounds
     assert loaded.base_rig.sha256 == small_avatar.base_rig.sha256
     _assert_equal(loaded.render(bent_pose(2), camera_above(24), settings=FEW), rendering)
+
+
+def test_an_avatar_with_oriented_cues_comes_back_with_them(
+    small_avatar: HandAvatar, tmp_path: Path
+) -> None:
+    torch.manual_seed(2)
+    avatar = HandAvatar(
+        small_avatar.base_rig, torch.zeros(10), rounds=0, num_anchors=64, cues=OrientedCues()
+    )
+    avatar.save(tmp_path / "avatar.safetensors")
+    loaded = HandAvatar.load(tmp_path / "avatar.safetensors")
+    _assert_equal(
+        loaded.render(bent_pose(1), camera_above(8), settings=FEW),
+        avatar.render(bent_pose(1), camera_above(8), settings=FEW),
+    )
 
 
 def test_moving_hand_and_camera_together_leaves_the_geometry(
@@ -260,8 +277,9 @@ def test_the_two_pass_gradient_is_the_whole_gradient(small_avatar: HandAvatar) -
     expected = torch.autograd.grad(_scalar(plain), list(parameters.values()))
     for name, ours, theirs in zip(parameters, found, expected, strict=True):
         assert float(theirs.norm()) > 0 or name.endswith("bias"), name
-        # float32 through a dozen layers and back; the offsets' common shift has no gradient.
-        assert float((ours - theirs).norm()) <= 1e-4 * float(theirs.norm()) + 1e-6, name
+        # float32 through a dozen layers and back. The offsets' common shift is undone at the wrist:
+        # its gradient (shape.mlp.output.bias) is a sum that cancels, known to 1e-5.
+        assert float((ours - theirs).norm()) <= 1e-4 * float(theirs.norm()) + 1e-5, name
 
 
 # --- edits ----------------------------------------------------------------------------------------
@@ -348,17 +366,9 @@ def test_another_schema_is_refused(file: Path, tmp_path: Path, about: object) ->
 
 
 @pytest.mark.parametrize("drop", ["rig.faces", "avatar.albedo", "avatar.occupancy.encoder"])
-def test_a_file_that_lacks_tensors_is_refused(
-    file: Path, tmp_path: Path, small_avatar: HandAvatar, drop: str
-) -> None:
-    about = {
-        "schema": 1,
-        "rig": "open-hand",
-        "rounds": 0,
-        "margin": small_avatar.occupancy.margin,
-        "softness": small_avatar.occupancy.softness,
-        "info": {},
-    }
+def test_a_file_that_lacks_tensors_is_refused(file: Path, tmp_path: Path, drop: str) -> None:
+    with safe_open(file, framework="pt") as opened:
+        about = json.loads(opened.metadata()["handavatar"])
     assert HandAvatar.load(_rewritten(file, tmp_path, about)).rounds == 0
     with pytest.raises(CheckpointError, match="not a complete avatar"):
         HandAvatar.load(_rewritten(file, tmp_path, about, drop))

@@ -6,7 +6,10 @@ import pytest
 from source_tree import imported_modules, modules
 
 # Left: a folder or top module. Right: what it may import besides itself.
-EVERYTHING_BELOW = "geometry hand capture field render edit avatar alignment animate evaluate train export view demo doctor"
+EVERYTHING_BELOW = (
+    "geometry hand capture field render edit avatar alignment animate evaluate train "
+    "export view demo doctor"
+)
 MAY_IMPORT = {
     name: set(allowed.split())
     for name, allowed in {

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import TINY, write_tiny_capture
+from safetensors.torch import load_file
 
 from handavatar.avatar import CheckpointError, HandAvatar
 from handavatar.capture.frames import CaptureError, read_capture
@@ -29,7 +30,14 @@ from handavatar.train.loop import (
     train,
     train_step,
 )
-from handavatar.train.runs import latest_checkpoint, load_checkpoint, open_run, read_log
+from handavatar.train.prior import SHIPPED_PRIOR
+from handavatar.train.runs import (
+    Checkpoint,
+    latest_checkpoint,
+    load_checkpoint,
+    open_run,
+    read_log,
+)
 
 STEPS = 6
 
@@ -107,6 +115,25 @@ def test_a_step_changes_all_but_the_frozen_encoder(tiny_capture: Path) -> None:
         assert any(name.startswith(part) for name in changed), part
 
 
+def test_warm_steps_train_the_appearance_alone(whole_run: Path) -> None:
+    checkpoints = [
+        load_checkpoint(checkpoint).tensors["model"]
+        for checkpoint in (
+            Checkpoint(whole_run / "checkpoints" / f"step-{step:09d}", step) for step in (2, 4)
+        )
+    ]
+    before = load_file(SHIPPED_PRIOR)
+    for name, value in before.items():
+        if name.startswith("decoder"):
+            assert torch.equal(checkpoints[0][f"avatar.occupancy.{name}"], value)
+    changed = [name for name in before if name.startswith("decoder.mlp")]
+    assert not all(
+        torch.equal(checkpoints[1][f"avatar.occupancy.{name}"], before[name]) for name in changed
+    )
+    logged = read_log(open_run(whole_run))
+    assert ["silhouette" in record for record in logged] == [False] * 3 + [True] * 3
+
+
 def test_the_run_folder_holds_everything(whole_run: Path, tiny_capture: Path) -> None:
     names = {path.name for path in whole_run.iterdir()}
     assert {"options.json", "run.json", "log.jsonl", "checkpoints", "avatar.safetensors"} <= names
@@ -114,7 +141,7 @@ def test_the_run_folder_holds_everything(whole_run: Path, tiny_capture: Path) ->
     assert kept == ["step-000000002", "step-000000004", "step-000000006"]
     run = open_run(whole_run)
     assert [record["step"] for record in read_log(run)] == list(range(1, STEPS + 1))
-    assert {"loss", "psnr", "color", "silhouette", "occupancy"} <= read_log(run)[0].keys()
+    assert {"loss", "psnr", "color", "silhouette", "occupancy"} <= read_log(run)[-1].keys()
     assert run.facts["capture"]["sha256"] == read_capture(tiny_capture).sha256
     assert run.facts["perceptual"] == perceptual_loss("substitute").name
     assert run.options["steps"] == STEPS and run.options["budget"]["patch_size"] == 16
@@ -127,7 +154,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(
     tiny_capture: Path, tmp_path: Path
 ) -> None:
     runs = [
-        train(_options(tiny_capture, tmp_path / str(index), steps=2, seed=seed))
+        train(_options(tiny_capture, tmp_path / str(index), steps=4, seed=seed))
         for index, seed in enumerate((3, 3, 4))
     ]
     first, second, third = ((run / "avatar.safetensors").read_bytes() for run in runs)
@@ -138,13 +165,13 @@ def test_tracked_poses_are_corrected_and_known_ones_are_not(
     tiny_capture: Path, whole_run: Path, tmp_path: Path
 ) -> None:
     capture = write_tiny_capture(tmp_path / "tracked", "ab", confidence=0.8)
-    run = open_run(train(_options(capture, tmp_path / "run", steps=2)))
+    run = open_run(train(_options(capture, tmp_path / "run", steps=4)))
     checkpoint = latest_checkpoint(run)
     assert checkpoint is not None
     model = load_checkpoint(checkpoint).tensors["model"]
     assert model["corrections.rotations"].shape == (1, 16, 3)
     assert bool(model["corrections.rotations"].any() & model["corrections.translations"].any())
-    assert "pose" in read_log(run)[0]
+    assert "pose" in read_log(run)[-1]
     known = latest_checkpoint(open_run(whole_run))
     assert known is not None
     names = load_checkpoint(known).tensors["model"]
@@ -271,6 +298,7 @@ def test_a_loss_that_is_not_finite_ends_the_run_and_keeps_the_checkpoint(
         step = arguments[5]
         return {"loss": float("nan") if step == 3 else 1.0, "psnr": 10.0}
 
+    monkeypatch.setitem(METHODS, "quick", replace(TINY, warm_steps=0))
     monkeypatch.setattr(loop, "train_step", diverging)
     with pytest.raises(FloatingPointError, match="step 3"):
         train(_options(tiny_capture, tmp_path / "run"))
@@ -305,7 +333,7 @@ def test_a_missing_prior_is_refused(tiny_capture: Path, tmp_path: Path) -> None:
 
 def test_pictures_smaller_than_a_patch_are_refused(tiny_capture: Path, tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(METHODS, "quick", replace(TINY, patch_size=49))
+        patch.setitem(METHODS, "quick", replace(TINY, patch_size=49, warm_steps=0))
         with pytest.raises(CaptureError, match="smaller than a 49 x 49 patch"):
             train(_options(tiny_capture, tmp_path / "run"))
 

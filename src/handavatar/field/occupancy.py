@@ -231,9 +231,11 @@ class PairOccupancy(nn.Module):
 
     def forward(self, codes: HandCodes, points: Float[Tensor, "points 3"]) -> Occupancy:
         """Occupancy at world points (metres), without gradient; the fast way."""
-        starts = range(0, max(len(points), 1), self.chunk)
-        chunks = [points[start : start + self.chunk] for start in starts]
-        pieces = mapped(lambda chunk: self._chunk_occupancy(codes, chunk), chunks)
+        # A core's cache wants small pieces; a GPU wants large ones, one after the other.
+        chunk = self.chunk if points.device.type == "cpu" else 128 * self.chunk
+        starts = range(0, max(len(points), 1), chunk)
+        chunks = [points[start : start + chunk] for start in starts]
+        pieces = mapped(lambda piece: self._chunk_occupancy(codes, piece), chunks)
         items = PairItems(
             torch.cat([p.items.points + start for p, start in zip(pieces, starts, strict=True)]),
             torch.cat([p.items.pairs for p in pieces]),
@@ -374,9 +376,10 @@ def local_points(
 def contains(
     boxes: PartBoxes, local: Float[Tensor, "points bones 3"]
 ) -> Bool[Tensor, "points bones"]:
-    """Whether each part's box, margin included, holds the point."""
+    """Whether each part's box, margin included, holds the point; never beyond the wrist's cut."""
     lower, upper = boxes.lower - boxes.margin, boxes.upper + boxes.margin
-    return ((local > lower) & (local < upper)).all(-1)
+    is_before_cut = (local[:, 0] - boxes.cut_point) @ boxes.cut_normal < 0
+    return ((local > lower) & (local < upper)).all(-1) & is_before_cut[:, None]
 
 
 def _paired_block(

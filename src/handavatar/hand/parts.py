@@ -32,12 +32,17 @@ class PartBoxes:
         lower: smallest corner of the part itself, metres, bone frame.
         upper: largest corner.
         margin: how far the part's occupancy reaches beyond its own box, metres.
+        cut_point: a point of the plane that cuts the wrist, in the wrist's frame; nothing of the
+            hand lies beyond it, whatever the boxes.
+        cut_normal: unit, pointing away from the hand.
     """
 
     bone_from_world: Float[Tensor, "bones 4 4"]
     lower: Float[Tensor, "bones 3"]
     upper: Float[Tensor, "bones 3"]
     margin: float
+    cut_point: Float[Tensor, "3"]
+    cut_normal: Float[Tensor, "3"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +93,13 @@ class Parts:
             empty = local.new_full((NUM_BONES, 3), torch.inf)
             lower = empty.scatter_reduce(0, index, local, "amin")
             upper = (-empty).scatter_reduce(0, index, local, "amax")
-        return PartBoxes(bone_from_world, lower, upper, margin)
+            rim = apply_rigid(bone_from_world[0], posed.vertices[posed.rig.rim])
+            spokes = rim - rim.mean(0)
+            # The rim runs along its faces' half edges, so this area vector points off the hand.
+            area = torch.linalg.cross(spokes.roll(-1, 0), spokes).sum(0)
+            normal = torch.nn.functional.normalize(area, dim=0)
+            outmost = rim[(spokes @ normal).argmax()]
+        return PartBoxes(bone_from_world, lower, upper, margin, outmost, normal)
 
 
 def divide_into_parts(rig: Rig, points_per_part: int = 256, seed: int = 0) -> Parts:

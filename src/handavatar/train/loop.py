@@ -89,7 +89,7 @@ class Method:
     cues: PaperCues | OrientedCues = field(default_factory=PaperCues)
     warm_steps: int = 0
     warm_pixels: int = 3072
-    warm_stride: int = 5
+    warm_stride: int = 6
     patch_strides: tuple[int, ...] = (1,)
     perceptual_weight: float = 1.0
     lr: float = 5e-4
@@ -112,12 +112,13 @@ METHODS: dict[str, Method] = {
         frames=1,
         patches=1,
         patch_size=32,
-        num_samples=32,
+        num_samples=64,
         silhouette_size=128,
         patch_strides=(1, 2, 4),
         perceptual_weight=0.1,
         lr=2e-3,
         lr_codes=1e-2,
+        lr_decoder=2e-4,
         occupancy_every=4,
     ),
     "paper": Method(
