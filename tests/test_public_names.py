@@ -23,7 +23,10 @@ EXACTLY = {
     "hand.open_hand": "Level load_open_hand",
     "hand.detail": "subdivided",
     "edit": "Edit bones_named",
-    "avatar": "CheckpointError HandAvatar HandState RayValues RenderSettings Rendering SCHEMA",
+    "avatar": (
+        "CheckpointError HandAvatar HandState RayValues RenderSettings Rendering SCHEMA "
+        "START_LIGHT VisibleSamples"
+    ),
     "capture.default": "default_capture",
 }
 AT_LEAST = {

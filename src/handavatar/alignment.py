@@ -16,7 +16,7 @@ def aligned_pose(
     camera: Camera,
     mask: Bool[Tensor, "height width"],
     steps: int = 20,
-    size: int = 128,
+    size: int = 192,
 ) -> HandPose:
     """A pose, moved a little so that the personal mesh covers the frame's mask.
 

@@ -90,7 +90,8 @@ def test_the_loss_of_a_patch_seen_again_and_again_falls(tiny_capture: Path) -> N
     perceptual = perceptual_loss("substitute")
     # All randomness comes from the step: the same one shows the same patch.
     figures = [
-        train_step(training, [frame], edges, perceptual, TINY, step=1, seed=0) for _ in range(12)
+        train_step(training, [frame], None, edges, perceptual, TINY, step=1, seed=0)
+        for _ in range(12)
     ]
     for name in ("loss", "color"):
         assert figures[-1][name] < figures[0][name], name
@@ -105,7 +106,7 @@ def test_a_step_changes_all_but_the_frozen_encoder(tiny_capture: Path) -> None:
     avatar = training.avatar
     before = {name: value.clone() for name, value in avatar.state_dict().items()}
     edges = unique_edges(avatar.rig.faces)
-    train_step(training, frames, edges, perceptual_loss("substitute"), TINY, 1, seed=0)
+    train_step(training, frames, None, edges, perceptual_loss("substitute"), TINY, 1, seed=0)
     changed = {n for n, value in avatar.state_dict().items() if not torch.equal(value, before[n])}
     fixed = {name for name in before if name.startswith("occupancy.encoder")}
     fixed |= {"coefficients", "anchor_corners", "anchor_barycentric"}

@@ -259,9 +259,11 @@ def _curves(run: Path) -> list[Curve]:
         return []
     records = [json.loads(line) for line in log.read_text().splitlines() if line.endswith("}")]
     return [
-        Curve(f"{name}, mean of 20 steps", _averaged([(r["step"], r[name]) for r in records]))
+        Curve(
+            f"{name}, mean of 20 steps",
+            _averaged([(record["step"], record[name]) for record in records if name in record]),
+        )
         for name in ("psnr", "silhouette", "color")
-        if records and name in records[0]
     ]
 
 

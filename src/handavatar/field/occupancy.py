@@ -104,7 +104,10 @@ class MaximumFusion:
         num_slots: int,
         slope: float,
     ) -> Float[Tensor, "slots"]:
-        """Value of each slot (a part at a point): sigmoid of ``slope`` times the largest logit."""
+        """Value of each slot (a part at a point): sigmoid of ``slope`` times the largest logit.
+
+        Source: paper Sec. 3.2, Eq. 1; with the paper's tau as slope, its soft variant.
+        """
         lowest = logits.new_full((num_slots,), -torch.inf)
         return soft_occupancy(lowest.scatter_reduce(0, slots, logits, "amax"), slope)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar, RenderSettings
@@ -19,10 +19,12 @@ from handavatar.capture.view import view_of
 from handavatar.evaluate.metrics import mean_color
 from handavatar.evaluate.perceptual import PerceptualLoss, perceptual_loss
 from handavatar.field.shading import OrientedCues, PaperCues
+from handavatar.field.shape import personal_hand
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside, unique_edges
 from handavatar.hand.open_hand import load_open_hand
-from handavatar.hand.rig import RigError
+from handavatar.hand.pose import HandPose
+from handavatar.hand.rig import PosedHand, RigError
 from handavatar.render.silhouette import silhouette_loss, soft_silhouette
 from handavatar.train.appearance import SeenSamples, appearance_loss, find_seen_samples
 from handavatar.train.corrections import PoseCorrections
@@ -56,9 +58,10 @@ class Method:
     Attributes:
         steps: optimisation steps.
         cues: what the illumination depends on: the paper's inputs, or these and the normal.
-        warm_steps: the first steps train albedo and illumination alone, on samples of the prior's
-            geometry that are found once (see ``train.appearance``).
-        warm_pixels: pixels per such step, from all frames.
+        warm_steps: the first steps fit the shape to one silhouette each, and albedo and
+            illumination on samples of the prior's geometry, found once (``train.appearance``);
+            later steps recall these.
+        warm_pixels: pixels per such step and per recall, from all frames.
         warm_stride: such steps know every so-manieth pixel in both directions.
         frames: frames per step.
         patches: patches per frame.
@@ -88,7 +91,7 @@ class Method:
     silhouette_size: int
     cues: PaperCues | OrientedCues = field(default_factory=PaperCues)
     warm_steps: int = 0
-    warm_pixels: int = 3072
+    warm_pixels: int = 2560
     warm_stride: int = 6
     patch_strides: tuple[int, ...] = (1,)
     perceptual_weight: float = 1.0
@@ -108,7 +111,7 @@ METHODS: dict[str, Method] = {
     "quick": Method(
         steps=450,
         cues=OrientedCues(),
-        warm_steps=250,
+        warm_steps=300,
         frames=1,
         patches=1,
         patch_size=32,
@@ -117,6 +120,7 @@ METHODS: dict[str, Method] = {
         patch_strides=(1, 2, 4),
         perceptual_weight=0.1,
         lr=2e-3,
+        lr_shape=2e-3,
         lr_codes=1e-2,
         lr_decoder=2e-4,
         occupancy_every=4,
@@ -209,19 +213,18 @@ def train(options: TrainOptions) -> Path:
     training.avatar.info["view"] = view_of(frames)
     run = _open_or_create(options, capture, perceptual.name, steps)
     with locked(run), _stop_signals() as stopped:
+        # Before the checkpoint is loaded: the samples are those of the prior's geometry.
+        seen = _prior_samples(training, frames, method) if method.warm_steps else None
         start = _restore(run, training)
         edges = unique_edges(training.avatar.rig.faces)
-        seen = None
         with Progress("train", steps, start) as progress:
             for step in range(start + 1, steps + 1):
                 _set_learning_rates(training.optimizer, method.decay ** ((step - 1) / steps))
-                if step <= method.warm_steps:
-                    seen = seen or _prior_samples(training, frames, method)
-                    figures = warm_step(training, seen, method, step, options.seed)
+                if seen is not None and step <= method.warm_steps:
+                    figures = warm_step(training, frames, seen, edges, method, step, options.seed)
                 else:
-                    seen = None
                     figures = train_step(
-                        training, frames, edges, perceptual, method, step, options.seed
+                        training, frames, seen, edges, perceptual, method, step, options.seed
                     )
                 if not all(math.isfinite(value) for value in figures.values()):
                     raise FloatingPointError(
@@ -272,7 +275,12 @@ def begin_training(
         "licence": capture.licence,
     }
     avatar = HandAvatar(
-        rig, capture.shape_coefficients, method.rounds, method.num_anchors, info=info
+        rig,
+        capture.shape_coefficients,
+        method.rounds,
+        method.num_anchors,
+        cues=method.cues,
+        info=info,
     )
     load_prior(avatar.occupancy, options.prior)
     avatar.start_from_color(
@@ -306,23 +314,77 @@ def _prior_samples(training: Training, frames: list[Frame], method: Method) -> S
     return find_seen_samples(training.avatar, frames, settings, method.warm_stride)
 
 
-def warm_step(
-    training: Training, seen: SeenSamples, method: Method, step: int, seed: int
-) -> dict[str, float]:
-    """One optimiser step of albedo and illumination; random numbers from ``(seed, step)``."""
-    generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
+def _some_pixels(
+    seen: SeenSamples, method: Method, generator: torch.Generator
+) -> Int[Tensor, "pixels"]:
     pixels = torch.randint(len(seen.colors), (method.warm_pixels,), generator=generator)
-    loss, squared = appearance_loss(training.avatar, seen, pixels.to(seen.colors.device))
+    return pixels.to(seen.colors.device)
+
+
+def warm_step(
+    training: Training,
+    frames: list[Frame],
+    seen: SeenSamples,
+    edges: Int[Tensor, "edges 2"],
+    method: Method,
+    step: int,
+    seed: int,
+) -> dict[str, float]:
+    """One optimiser step of appearance on ``seen``, and of the shape on one frame's silhouette."""
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
     training.optimizer.zero_grad(set_to_none=True)
-    loss.backward()
+    color, squared = appearance_loss(training.avatar, seen, _some_pixels(seen, method, generator))
+    number = _frame_number(len(frames), step - 1, seed)
+    pose, losses = _corrected_pose(training, frames[number], number)
+    rest = training.avatar.rig.shaped(training.avatar.coefficients)
+    offsets = training.avatar.shape(rest, pose.rotations)
+    posed = personal_hand(rest, offsets).posed(pose)
+    losses |= shape_losses(posed, offsets, frames[number], edges, method)
+    losses["color"] = color
+    total = torch.stack(list(losses.values())).sum()
+    total.backward()
     training.optimizer.step()
-    value = float(loss.detach())
-    return {"color": value, "loss": value, "psnr": -10 * math.log10(max(float(squared), 1e-10))}
+    figures = {name: float(value.detach()) for name, value in losses.items()}
+    psnr = -10 * math.log10(max(float(squared), 1e-10))
+    return figures | {"loss": float(total.detach()), "psnr": psnr}
+
+
+def _corrected_pose(
+    training: Training, frame: Frame, number: int
+) -> tuple[HandPose, dict[str, Tensor]]:
+    """The frame's pose as training sees it, and what its correction costs."""
+    pose = frame.pose.to(training.avatar.device)
+    if training.corrections is None:
+        return pose, {}
+    penalty = 0.01 * training.corrections.penalty(number)
+    return training.corrections(number, pose), {"pose": penalty}
+
+
+def shape_losses(
+    posed: PosedHand,
+    offsets: Float[Tensor, "vertices 3"],
+    frame: Frame,
+    edges: Int[Tensor, "edges 2"],
+    method: Method,
+) -> dict[str, Tensor]:
+    """L_shape on a small mask, and what keeps the personal offsets smooth.
+
+    Source: paper Sec. 3.1, L_shape.
+    """
+    size = method.silhouette_size
+    camera = frame.camera.to(posed.vertices.device).resized(size, size)
+    mask = _resized_mask(frame.mask, size).to(posed.vertices.device)
+    coverage = soft_silhouette(posed.vertices, posed.rig.faces, camera)
+    return {
+        "silhouette": silhouette_loss(coverage, mask),
+        "offsets": 0.1 * offset_loss(offsets, edges),
+    }
 
 
 def train_step(
     training: Training,
     frames: list[Frame],
+    seen: SeenSamples | None,
     edges: Int[Tensor, "edges 2"],
     perceptual: PerceptualLoss,
     method: Method,
@@ -330,6 +392,9 @@ def train_step(
     seed: int,
 ) -> dict[str, float]:
     """One optimiser step over the step's own frames, patches and random numbers.
+
+    A step with few frames would pull the illumination towards just these; where ``seen`` is
+    given, pixels of all frames keep it in place (the loss "recall").
 
     All randomness comes from ``(seed, step)``, so that a resumed training repeats nothing and
     skips nothing.
@@ -350,6 +415,10 @@ def train_step(
         total.backward()
         for name, value in {**losses, "loss": total * method.frames, "squared": squared}.items():
             sums[name] = sums.get(name, 0.0) + float(value.detach()) / method.frames
+    if seen is not None:
+        recall, _ = appearance_loss(training.avatar, seen, _some_pixels(seen, method, generator))
+        recall.backward()
+        sums["recall"] = float(recall.detach())
     training.optimizer.step()
     sums["psnr"] = -10 * math.log10(max(sums.pop("squared"), 1e-10))
     return sums
@@ -368,19 +437,10 @@ def frame_losses(
     """All losses of one frame; ``squared_error`` beside them for the record."""
     avatar = training.avatar
     device = avatar.device
-    pose = frame.pose.to(device)
-    losses: dict[str, Tensor] = {}
-    if training.corrections is not None:
-        pose = training.corrections(number, pose)
-        losses["pose"] = 0.01 * training.corrections.penalty(number)
+    pose, losses = _corrected_pose(training, frame, number)
     state = avatar.prepare(pose)
-
+    losses |= shape_losses(state.posed, state.offsets, frame, edges, method)
     camera = frame.camera.to(device)
-    small = camera.resized(method.silhouette_size, method.silhouette_size)
-    mask = _resized_mask(frame.mask, method.silhouette_size).to(device)
-    coverage = soft_silhouette(state.posed.vertices, avatar.rig.faces, small)
-    losses["silhouette"] = silhouette_loss(coverage, mask)
-    losses["offsets"] = 0.1 * offset_loss(state.offsets, edges)
 
     if step % method.occupancy_every == 0:
         margin = avatar.occupancy.margin
