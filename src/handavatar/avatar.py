@@ -73,7 +73,7 @@ class RenderSettings:
             millimetres from both its ends is missed.
         group: coarse samples evaluated at a time along the ray before it may end.
         mask_margin: only pixels within this share of the picture's width of the posed mesh are
-            looked at; 8 pixels of 256. The occupancy of a trained field ends some millimetres
+            looked at; 6 pixels of 256. The occupancy of a trained field ends some millimetres
             off the mesh; infinity looks at all pixels.
         rays_at_once: bounds the memory.
     """
@@ -84,7 +84,7 @@ class RenderSettings:
     coarse: int = 4
     refine_above: float = 3e-7
     group: int = 4
-    mask_margin: float = 8 / 256
+    mask_margin: float = 6 / 256
     rays_at_once: int = 4096
 
 

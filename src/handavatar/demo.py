@@ -36,8 +36,8 @@ class DemoOptions:
 
     out: Path = Path("demo")
     steps: int | None = None
-    frames: int = 36
-    size: int = 160
+    frames: int = 24
+    size: int = 128
     device: Literal["auto", "cpu", "cuda"] = "auto"
     seed: int = 0
 
@@ -120,7 +120,8 @@ def edited_pictures(avatar: HandAvatar) -> np.ndarray:
         Edit(albedo_shift=(-0.05, 0.05, 0.2)),
         Edit(lifted_bones=bones_named(("thumb", "index", "middle"))),
     )
-    pictures = [pass_pictures(avatar.render(frame.pose, frame.camera, e))["rgb"] for e in edits]
+    camera = frame.camera.resized(128, 128)
+    pictures = [pass_pictures(avatar.render(frame.pose, camera, edit))["rgb"] for edit in edits]
     return np.concatenate(pictures, axis=1)
 
 

@@ -1,5 +1,6 @@
 """``handavatar capture``: make captures and check them."""
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,9 @@ def video(words: list[str]) -> int:
         capture_video(
             options, progress=lambda share, stage: progress.update(round(100 * share), stage)
         )
+    skipped = json.loads((options.out / "skipped.json").read_text(encoding="utf-8"))
+    for name, reason in skipped.items():
+        print(f"skipped {name}: {reason}")
     print(f"capture: {options.out}\nnext: handavatar train {options.out}")
     return 0
 

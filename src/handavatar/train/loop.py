@@ -109,7 +109,7 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "quick": Method(
-        steps=450,
+        steps=410,
         cues=OrientedCues(),
         warm_steps=300,
         frames=1,
