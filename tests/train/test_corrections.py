@@ -5,7 +5,7 @@ import math
 import torch
 
 from handavatar.hand.pose import NUM_BONES, HandPose
-from handavatar.train.corrections import PoseCorrections
+from handavatar.train.corrections import ROTATION_SCALE, TRANSLATION_SCALE, PoseCorrections
 
 
 def _pose() -> HandPose:
@@ -24,8 +24,8 @@ def test_they_start_at_no_correction() -> None:
 def test_each_frame_has_its_own() -> None:
     corrections, pose = PoseCorrections(3), _pose()
     with torch.no_grad():
-        corrections.rotations[2, 4, 1] = 0.1
-        corrections.translations[2, 0] = -0.01
+        corrections.rotations[2, 4, 1] = 0.1 / ROTATION_SCALE
+        corrections.translations[2, 0] = -0.01 / TRANSLATION_SCALE
     assert torch.equal(corrections(0, pose).rotations, pose.rotations)
     moved = corrections(2, pose)
     torch.testing.assert_close(moved.rotations[4, 1], pose.rotations[4, 1] + 0.1)
@@ -38,7 +38,7 @@ def test_each_frame_has_its_own() -> None:
 def test_the_penalty_is_one_at_six_degrees_or_five_millimetres() -> None:
     corrections = PoseCorrections(2)
     with torch.no_grad():
-        corrections.rotations[0, 3, 0] = math.radians(5.73)
-        corrections.translations[1, 2] = 0.005
+        corrections.rotations[0, 3, 0] = math.radians(5.73) / ROTATION_SCALE
+        corrections.translations[1, 2] = 0.005 / TRANSLATION_SCALE
     for frame in (0, 1):
         torch.testing.assert_close(corrections.penalty(frame), torch.tensor(1.0), atol=1e-3, rtol=0)
