@@ -369,3 +369,13 @@ def test_an_empty_mask_gives_the_middle() -> None:
 def test_every_epoch_shows_every_frame_once_in_another_order() -> None:
     epochs = [[loop._frame_number(7, 7 * epoch + i, seed=1) for i in range(7)] for epoch in (0, 1)]
     assert sorted(epochs[0]) == sorted(epochs[1]) == list(range(7)) and epochs[0] != epochs[1]
+
+
+def test_a_run_of_another_seed_is_not_continued(tiny_capture: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    options = replace(_options(tiny_capture, run), steps=1)
+    train(options)
+    with pytest.raises(CheckpointError, match="was begun with seed 0, now it is 1"):
+        train(replace(options, seed=options.seed + 1))
+    with pytest.raises(ValueError, match="--steps 0"):
+        train(replace(options, steps=0))

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from handavatar.avatar import HandAvatar, RenderSettings
+from handavatar.avatar import CheckpointError, HandAvatar, RenderSettings
 from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
 from handavatar.capture.view import view_of
 from handavatar.evaluate.metrics import mean_color
@@ -200,7 +200,9 @@ def train(options: TrainOptions) -> Path:
     """
     device = chosen_device(options.device)
     method = METHODS[options.method]
-    steps = options.steps or method.steps
+    steps = method.steps if options.steps is None else options.steps
+    if steps < 1:
+        raise ValueError(f"--steps {steps}: expected at least 1")
     capture = read_capture(options.capture)
     indices = capture.split("train")
     if not indices:
@@ -546,7 +548,9 @@ def _open_or_create(options: TrainOptions, capture: Capture, perceptual: str, st
         if folder is not None and (folder / "avatar.safetensors").exists():
             folder = None
     if folder is not None and options.resume == "auto" and (folder / "run.json").exists():
-        return open_run(folder)
+        run = open_run(folder)
+        _require_same_training(run, options, capture)
+        return run
     folder = folder or default_run_folder(options.capture, options.method)
     record = {
         name: str(value) if isinstance(value, Path) else value
@@ -562,6 +566,19 @@ def _open_or_create(options: TrainOptions, capture: Capture, perceptual: str, st
         capture_sha256=capture.sha256,
         perceptual=perceptual,
     )
+
+
+def _require_same_training(run: Run, options: TrainOptions, capture: Capture) -> None:
+    """A run goes on with what it was begun with, or not at all."""
+    facts = run.facts
+    then = (facts["capture"]["sha256"], facts["seed"], run.options["method"])
+    now = (capture.sha256, options.seed, options.method)
+    for what, old, new in zip(("capture", "seed", "method"), then, now, strict=True):
+        if old != new:
+            raise CheckpointError(
+                f"{run.folder}: was begun with {what} {str(old)[:12]}, now it is {str(new)[:12]}\n"
+                "name another folder with --out, or begin anew with --resume never"
+            )
 
 
 def _save(run: Run, training: Training, step: int) -> None:
