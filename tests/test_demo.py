@@ -36,7 +36,7 @@ def test_the_demonstration_leaves_everything_it_promises(
     with av.open(str(out / "novel_poses.mp4")) as container:
         assert len(list(container.decode(video=0))) == 2
     with Image.open(out / "edits.png") as picture:
-        assert picture.size == (5 * 256, 256)
+        assert picture.size == (5 * 128, 128)
     HandAvatar.load(out / "avatar.safetensors")
 
     # Told again, it continues: nothing is left to train.

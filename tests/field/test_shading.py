@@ -4,7 +4,13 @@ import torch
 from torch import Tensor
 
 from handavatar.field.anchors import Neighbours
-from handavatar.field.shading import AlbedoField, IlluminationField, directed_occupancy
+from handavatar.field.shading import (
+    AlbedoField,
+    IlluminationField,
+    OrientedCues,
+    PaperCues,
+    directed_occupancy,
+)
 from handavatar.hand.pose import NUM_BONES
 
 
@@ -48,9 +54,11 @@ def _neighbours(queries: int = 6, anchors: int = 50) -> Neighbours:
 def test_albedo_and_illumination_are_in_range_and_of_the_papers_sizes() -> None:
     torch.manual_seed(0)
     albedo = AlbedoField(50)
-    illumination = IlluminationField(torch.rand(50, 3))
+    illumination = IlluminationField(torch.rand(50, 3), PaperCues())
     color = albedo(_neighbours())
-    light = illumination(torch.zeros(NUM_BONES, 3), _neighbours(), torch.rand(6, NUM_BONES))
+    light = illumination(
+        torch.zeros(NUM_BONES, 3), _neighbours(), torch.rand(6, NUM_BONES), torch.rand(6, 3)
+    )
     for value in (color.detach(), light.detach()):
         assert 0 <= float(value.min()) <= float(value.max()) <= 1
     assert color.shape == (6, 3) and light.shape == (6,)
@@ -64,9 +72,22 @@ def test_albedo_and_illumination_are_in_range_and_of_the_papers_sizes() -> None:
 
 def test_light_depends_on_pose_and_shadow() -> None:
     torch.manual_seed(0)
-    field, there = IlluminationField(torch.rand(50, 3)), _neighbours()
+    field, there = IlluminationField(torch.rand(50, 3), PaperCues()), _neighbours()
+    up = torch.tensor([[0.0, 1.0, 0.0]]).expand(6, -1)
     flat = torch.zeros(NUM_BONES, 3)
     clear = torch.zeros(6, NUM_BONES)
-    light = field(flat, there, clear)
-    assert not torch.allclose(light, field(flat + 0.5, there, clear))
-    assert not torch.allclose(light, field(flat, there, clear + 0.5))
+    light = field(flat, there, clear, up)
+    assert not torch.allclose(light, field(flat + 0.5, there, clear, up))
+    assert not torch.allclose(light, field(flat, there, clear + 0.5, up))
+    assert torch.equal(light, field(flat, there, clear, -up)), "the paper's cues hold no normal"
+
+
+def test_oriented_light_depends_on_the_normal_and_a_pose_per_query_is_the_same_pose() -> None:
+    torch.manual_seed(0)
+    field, there = IlluminationField(torch.rand(50, 3), OrientedCues()), _neighbours()
+    flat, clear = torch.zeros(NUM_BONES, 3), torch.zeros(6, NUM_BONES)
+    up = torch.tensor([[0.0, 1.0, 0.0]]).expand(6, -1)
+    assert field.mlp.hidden[0].in_features == 88
+    light = field(flat, there, clear, up)
+    assert not torch.allclose(light, field(flat, there, clear, -up))
+    assert torch.equal(light, field(flat.expand(6, -1, -1), there, clear, up))
