@@ -7,7 +7,7 @@ from torch import Tensor
 from handavatar.avatar import HandAvatar
 from handavatar.geometry.cameras import Camera
 from handavatar.hand.pose import HandPose
-from handavatar.render.silhouette import silhouette_loss, soft_silhouette
+from handavatar.render.silhouette import resized_mask, silhouette_loss, soft_silhouette
 
 
 def aligned_pose(
@@ -34,8 +34,7 @@ def aligned_pose(
     device = avatar.device
     pose = pose.to(device)
     camera = camera.to(device).resized(size, size)
-    shares = torch.nn.functional.interpolate(mask[None, None].float(), (size, size), mode="area")
-    small_mask = (shares[0, 0] > 0.5).to(device)
+    small_mask = resized_mask(mask, size).to(device)
     with torch.no_grad():
         rest = avatar.personal(pose)
     change = torch.zeros_like(pose.rotations, requires_grad=True)

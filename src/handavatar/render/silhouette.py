@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from handavatar.geometry.cameras import Camera, project
 from handavatar.render.rasterize import (
@@ -145,6 +146,12 @@ def _outline(
     sides = torch.cat([middle + across, middle - across])
     is_covered = _is_covered(sides, pixels.double()[faces], math.ceil(radius) + 1, width, height)
     return pieces.chosen(~is_covered.reshape(2, -1).all(0))
+
+
+def resized_mask(mask: Bool[Tensor, "height width"], size: int) -> Bool[Tensor, "size size"]:
+    """A mask with ``size`` pixels along a side: true where more than half of the pixel was."""
+    shares = interpolate(mask[None, None].float(), (size, size), mode="area")
+    return shares[0, 0] > 0.5
 
 
 def _contour_edges(

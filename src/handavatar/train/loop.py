@@ -25,7 +25,7 @@ from handavatar.geometry.meshes import is_inside, unique_edges
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, RigError
-from handavatar.render.silhouette import silhouette_loss, soft_silhouette
+from handavatar.render.silhouette import resized_mask, silhouette_loss, soft_silhouette
 from handavatar.train.appearance import SeenSamples, appearance_loss, find_seen_samples
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.losses import color_loss, occupancy_loss, offset_loss
@@ -375,7 +375,7 @@ def shape_losses(
     """
     size = method.silhouette_size
     camera = frame.camera.to(posed.vertices.device).resized(size, size)
-    mask = _resized_mask(frame.mask, size).to(posed.vertices.device)
+    mask = resized_mask(frame.mask, size).to(posed.vertices.device)
     coverage = soft_silhouette(posed.vertices, posed.rig.faces, camera)
     return {
         "silhouette": silhouette_loss(coverage, mask),
@@ -521,12 +521,6 @@ def patch_pixels(
     left = min(max(int(center[1]) - extent // 2, 0), width - extent)
     y, x = torch.meshgrid(top + steps, left + steps, indexing="ij")
     return torch.stack([x, y], dim=-1).flatten(0, 1)
-
-
-def _resized_mask(mask: Tensor, size: int) -> Tensor:
-    """True where more than half of a small pixel is hand."""
-    shares = torch.nn.functional.interpolate(mask[None, None].float(), (size, size), mode="area")
-    return shares[0, 0] > 0.5
 
 
 def _frame_number(num_frames: int, visit: int, seed: int) -> int:
