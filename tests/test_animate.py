@@ -16,7 +16,6 @@ from handavatar.animate import (
     RenderOptions,
     camera_on,
     edit_from,
-    opened_avatar,
     orbited,
     pass_pictures,
     render_motion,
@@ -155,9 +154,9 @@ def test_missing_avatars_and_motions_are_errors(
     avatar_file: Path, motion_file: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(CheckpointError, match=r"holds no avatar\.safetensors"):
-        opened_avatar(tmp_path)
+        HandAvatar.load(tmp_path)
     with pytest.raises(CheckpointError, match="no such file"):
-        opened_avatar(tmp_path / "nothing")
+        HandAvatar.load(tmp_path / "nothing")
     with pytest.raises(CaptureError):
         render_motion(_options(avatar_file, tmp_path / "none.json", tmp_path / "out"))
     assert not list(tmp_path.iterdir())

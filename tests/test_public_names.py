@@ -25,7 +25,7 @@ EXACTLY = {
     "edit": "Edit bones_named",
     "avatar": (
         "CheckpointError HandAvatar HandState RayValues RenderSettings Rendering SCHEMA "
-        "START_LIGHT VisibleSamples"
+        "START_LIGHT VisibleSamples chosen_device"
     ),
     "capture.default": "default_capture",
 }

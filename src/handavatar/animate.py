@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from handavatar.avatar import CheckpointError, HandAvatar, Rendering, RenderSettings
+from handavatar.avatar import HandAvatar, Rendering, RenderSettings, chosen_device
 from handavatar.capture.motion import MOTIONS, Motion, named_motion, read_motion
 from handavatar.edit import Edit, bones_named
 from handavatar.geometry.cameras import Camera, look_at, project
@@ -86,9 +86,8 @@ def render_motion(options: RenderOptions) -> Path:
                 f"--passes: there is no pass '{name}'; choose from {', '.join(PASSES)}"
             )
     edit = edit_from(options.light_gain, options.albedo_shift, options.lift_shadow)
-    avatar = opened_avatar(options.run)
-    if options.device == "cuda" or (options.device == "auto" and torch.cuda.is_available()):
-        avatar.moved_to("cuda")
+    avatar = HandAvatar.load(options.run)
+    avatar.moved_to(chosen_device(options.device))
     motion = _chosen_motion(avatar, options.motion)
     steps = _spread(len(motion), options.frames)
     poses = [motion.pose(step) for step in steps]
@@ -131,19 +130,6 @@ def edit_from(light_gain: float, albedo_shift: str, lift_shadow: str) -> Edit:
         )
     names = tuple(word.strip() for word in lift_shadow.split(",") if word.strip())
     return Edit(light_gain, (red, green, blue), bones_named(names))
-
-
-def opened_avatar(run: Path) -> HandAvatar:
-    """The avatar of a run folder or of an avatar file."""
-    if run.is_dir():
-        file = run / "avatar.safetensors"
-        if not file.is_file():
-            raise CheckpointError(
-                f"{run}: holds no avatar.safetensors; finish its training with "
-                "`handavatar train ... --resume auto`"
-            )
-        return HandAvatar.load(file)
-    return HandAvatar.load(run)
 
 
 def camera_on(avatar: HandAvatar, poses: list[HandPose], size: int) -> Camera:

@@ -53,6 +53,19 @@ _RIG_TENSORS = (
 )
 
 
+def chosen_device(name: str) -> torch.device:
+    """``auto`` is CUDA where there is one.
+
+    Raises:
+        ValueError: if ``cuda`` is asked for and there is none.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: no CUDA device is visible to torch; use --device cpu")
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(name)
+
+
 class CheckpointError(ValueError):
     """A file of weights that cannot be used: which, what is wrong with it, what to do."""
 
@@ -479,10 +492,20 @@ class HandAvatar(nn.Module):
     def load(path: Path | str) -> "HandAvatar":
         """Reads an avatar back.
 
+        Args:
+            path: an avatar file, or the folder of a finished run.
+
         Raises:
             CheckpointError: if the file is missing, damaged, or not an avatar of this schema.
         """
         path = Path(path)
+        if path.is_dir():
+            if not (path / "avatar.safetensors").is_file():
+                raise CheckpointError(
+                    f"{path}: holds no avatar.safetensors; finish its training with "
+                    "`handavatar train ... --resume auto`"
+                )
+            path = path / "avatar.safetensors"
         if not path.is_file():
             raise CheckpointError(f"{path}: no such file; train an avatar or name an existing one")
         try:

@@ -13,12 +13,10 @@ from PIL import Image
 
 from handavatar.animate import RenderOptions, pass_pictures, render_motion
 from handavatar.avatar import HandAvatar
-from handavatar.capture.frames import read_capture
+from handavatar.capture.default import default_capture
 from handavatar.edit import Edit, bones_named
 from handavatar.evaluate.run import EvaluateOptions, evaluate_run
 from handavatar.train.loop import TrainOptions, train
-
-SHIPPED_CAPTURE = Path(__file__).parent / "assets" / "default_capture"
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,7 @@ def run_demo(options: DemoOptions) -> Path:
     _say("1/4 training on the shipped capture", begin)
     train(
         TrainOptions(
-            capture=SHIPPED_CAPTURE,
+            capture=default_capture().folder,
             out=run,
             steps=options.steps,
             device=options.device,
@@ -111,7 +109,7 @@ def edited_pictures(avatar: HandAvatar) -> np.ndarray:
 
     Source: paper supplement (texture editing).
     """
-    capture = read_capture(SHIPPED_CAPTURE)
+    capture = default_capture()
     frame = capture.frame(capture.split("test")[0])
     edits = (
         Edit(),

@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from handavatar.alignment import aligned_pose
-from handavatar.avatar import CheckpointError, HandAvatar, Rendering
+from handavatar.avatar import HandAvatar, Rendering, chosen_device
 from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
 from handavatar.evaluate.metrics import (
     JudgedFrame,
@@ -66,8 +66,7 @@ def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
     Source: paper Sec. 4.1 (metrics).
     """
     avatar, capture, out = _opened(options)
-    if options.device == "cuda" or (options.device == "auto" and torch.cuda.is_available()):
-        avatar.moved_to("cuda")
+    avatar.moved_to(chosen_device(options.device))
     indices = _spread(capture.split(options.split), options.max_frames)
     if not indices:
         raise CaptureError(
@@ -101,23 +100,19 @@ def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
 def _opened(options: EvaluateOptions) -> tuple[HandAvatar, Capture, Path]:
     run = options.run
     if run.is_dir():
-        avatar_file = run / "avatar.safetensors"
-        if not avatar_file.is_file():
-            raise CheckpointError(
-                f"{run}: holds no avatar.safetensors; finish its training with "
-                "`handavatar train ... --resume auto`"
-            )
+        avatar = HandAvatar.load(run)
         folder = options.capture
         if folder is None:
             facts = json.loads((run / "run.json").read_text())
             folder = Path(facts["capture"]["path"])
         out = options.out or run / "evaluation"
     else:
-        avatar_file, folder = run, options.capture
+        folder = options.capture
         if folder is None:
             raise CaptureError(f"{run}: a file alone names no capture", "name one with --capture")
+        avatar = HandAvatar.load(run)
         out = options.out or run.parent / f"{run.stem}-evaluation"
-    return HandAvatar.load(avatar_file), read_capture(folder), out
+    return avatar, read_capture(folder), out
 
 
 def _spread(indices: tuple[int, ...], count: int | None) -> list[int]:

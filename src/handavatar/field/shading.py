@@ -79,8 +79,7 @@ class OrientedCues:
     """The paper's inputs and the surface's world normal: 88.
 
     Departs: light depends on where the surface looks. The paper's network must work that out from
-        pose and place, for which a hundred frames do not suffice: on the shipped capture's unseen
-        poses the normal is worth 2.5 dB. Method ``paper`` does without it.
+        pose and place, for which a hundred frames do not suffice. Method ``paper`` does without it.
     """
 
     name = "oriented"

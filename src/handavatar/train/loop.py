@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from handavatar.avatar import CheckpointError, HandAvatar, RenderSettings
+from handavatar.avatar import CheckpointError, HandAvatar, RenderSettings, chosen_device
 from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
 from handavatar.capture.view import view_of
 from handavatar.evaluate.metrics import mean_color
@@ -242,19 +242,6 @@ def train(options: TrainOptions) -> Path:
                     raise Interrupted(f"stopped at step {step}; continue with --resume auto")
     training.avatar.save(run.avatar)
     return run.folder
-
-
-def chosen_device(name: str) -> torch.device:
-    """``auto`` is CUDA where there is one.
-
-    Raises:
-        ValueError: if ``cuda`` is asked for and there is none.
-    """
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda: no CUDA device is visible to torch; use --device cpu")
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    return torch.device(name)
 
 
 def begin_training(
