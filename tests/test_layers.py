@@ -20,10 +20,10 @@ MAY_IMPORT = {
         "field": "geometry hand",
         "edit": "hand",
         "avatar": "geometry hand field render edit",
-        # Fits a pose to a mask with the avatar's mesh.
-        "alignment": "geometry hand render avatar",
+        # Fits a pose to a mask with any shaped hand.
+        "alignment": "geometry hand render",
         "evaluate": "geometry hand capture avatar alignment",
-        "train": "geometry hand capture field render avatar evaluate",
+        "train": "geometry hand capture field render avatar alignment evaluate",
         "export": "geometry hand capture edit avatar",
         "view": "geometry hand capture edit avatar",
         # Motions to pictures: what a viewer may see, and the rasteriser's neighbours.

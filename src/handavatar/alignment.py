@@ -1,59 +1,156 @@
-"""Fits the pose of a held-out frame to its mask, never to its colours."""
+"""Draws a pose to the outline of a mask, never to the picture's colours.
+
+Trackers are off by some pixels. Here the mesh's outline is laid onto the border of the mask by
+Gauss-Newton steps: the residuals are the distances between the two along the outline, pixels, and
+the unknowns are all joint rotations and the translation.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.func import jacfwd
 
-from handavatar.avatar import HandAvatar
-from handavatar.geometry.cameras import Camera
-from handavatar.hand.pose import HandPose
-from handavatar.render.silhouette import resized_mask, silhouette_loss, soft_silhouette
+from handavatar.geometry.cameras import Camera, project
+from handavatar.hand.pose import HandPose, bone_transforms, linear_blend_skinning
+from handavatar.hand.rig import ShapedHand
+from handavatar.render.rasterize import rasterize
+from handavatar.render.silhouette import OutlinePoints, outline_points, signed_distance
+
+# Of the picture's width: how far apart outline and border are in a good fit, and how far apart
+# they may be before something else than the pose is at fault.
+_EXPECTED = 0.7 / 256
+_OUTLIER = 1.5 / 256
+# Neighbouring points err together: the whole outline says as much as so many independent ones.
+_INDEPENDENT_POINTS = 200
+# Expected errors of the pose to start from: radians; metres across and along the line of sight.
+_ROTATION_ERROR = 0.12
+_TRANSLATION_ERROR = (0.006, 0.006, 0.020)
 
 
+@torch.no_grad()
 def aligned_pose(
-    avatar: HandAvatar,
+    hand_of: Callable[[HandPose], ShapedHand],
     pose: HandPose,
     camera: Camera,
     mask: Bool[Tensor, "height width"],
-    steps: int = 20,
-    size: int = 192,
+    steps: int = 8,
+    start: HandPose | None = None,
 ) -> HandPose:
-    """A pose, moved a little so that the personal mesh covers the frame's mask.
+    """A pose, moved a little so that the outline of the hand lies on the border of the mask.
 
-    Training corrects the poses of its own frames; held-out frames get the same chance here, with
-    nothing but the outline to go by.
+    Where the mesh ends at the wrist, the mask was cut by a mesh too: nothing is asked of these
+    points. The result covers the mask at least as well as what it began with.
 
     Args:
-        avatar: whose mesh is fitted; it is not changed.
-        pose: to start from.
-        camera: of the frame.
-        mask: of the frame.
-        steps: of gradient descent.
-        size: pixels along a side of the compared masks.
+        hand_of: the rest hand of a pose.
+        pose: as tracked; the result stays near it as far as the outline does not object.
+        camera: of the picture.
+        mask: true on the hand.
+        steps: of Gauss-Newton.
+        start: where to begin, if not at ``pose``.
     """
-    device = avatar.device
-    pose = pose.to(device)
-    camera = camera.to(device).resized(size, size)
-    small_mask = resized_mask(mask, size).to(device)
-    with torch.no_grad():
-        rest = avatar.personal(pose)
-    change = torch.zeros_like(pose.rotations, requires_grad=True)
-    shift = torch.zeros_like(pose.translation, requires_grad=True)
-    optimizer = torch.optim.Adam(
-        [{"params": [change], "lr": 0.01}, {"params": [shift], "lr": 1e-3}]
+    found = start or pose
+    if not bool(mask.any()) or steps == 0:
+        return found
+    distance = _smoothed(signed_distance(mask).to(pose.rotations.device))
+    before = _overlap(hand_of(found), found, camera, mask)
+    first = found
+    for _ in range(steps):
+        hand = hand_of(found)
+        points = _usable_points(hand, found, camera)
+        if len(points.ends) == 0:
+            return first
+        found = _stepped(hand, points, pose, found, camera, distance)
+        if not bool(
+            torch.isfinite(found.rotations).all() & torch.isfinite(found.translation).all()
+        ):
+            return first
+    return found if _overlap(hand_of(found), found, camera, mask) >= before else first
+
+
+def _stepped(
+    hand: ShapedHand,
+    points: OutlinePoints,
+    tracked: HandPose,
+    current: HandPose,
+    camera: Camera,
+    distance: Float[Tensor, "height width"],
+) -> HandPose:
+    """One Gauss-Newton step from ``current``."""
+    rest, weights = points.of(hand.rest_vertices), points.of(hand.rig.skin_weights)
+
+    def seen(values: Float[Tensor, "unknowns"]) -> Float[Tensor, "points 2"]:
+        rotations, translation = values[:-3].reshape(-1, 3), values[-3:]
+        transforms = bone_transforms(rotations, hand.rest_joints)
+        placed = linear_blend_skinning(rest, weights, transforms, hand.rest_joints)
+        return project(camera, placed + translation)[0]
+
+    values = torch.cat([current.rotations.flatten(), current.translation])
+    pixels = seen(values)
+    residuals, slope = _sampled(distance, pixels)
+    jacobian = torch.einsum("pi,piu->pu", slope, jacfwd(seen)(values))
+    # Geman and McClure's weights: what is far off has its own reasons.
+    scale = camera.width * torch.tensor([_EXPECTED, _OUTLIER], device=values.device)
+    trust = points.lengths / points.lengths.sum() * _INDEPENDENT_POINTS
+    trust = trust / ((1 + (residuals / scale[1]).square()).square() * scale[0] ** 2)
+    moved = values - torch.cat([tracked.rotations.flatten(), tracked.translation])
+    prior = _prior(len(values), camera)
+    normal = torch.einsum("pu,p,pv->uv", jacobian, trust, jacobian) + prior
+    gradient = torch.einsum("pu,p,p->u", jacobian, trust, residuals) + prior @ moved
+    values = values - torch.linalg.solve(normal, gradient)
+    return HandPose(values[:-3].reshape(-1, 3), values[-3:])
+
+
+def _prior(size: int, camera: Camera) -> Float[Tensor, "unknowns unknowns"]:
+    """Inverse covariance of the tracked pose's errors."""
+    rotation = camera.camera_from_world[:3, :3]
+    prior = torch.eye(size, device=rotation.device) / _ROTATION_ERROR**2
+    spread = torch.tensor(_TRANSLATION_ERROR, device=rotation.device)
+    prior[-3:, -3:] = rotation.T @ torch.diag(spread**-2) @ rotation
+    return prior
+
+
+def _usable_points(hand: ShapedHand, pose: HandPose, camera: Camera) -> OutlinePoints:
+    points = outline_points(hand.posed(pose).vertices, hand.rig.faces, camera)
+    is_rim = torch.zeros(hand.rig.num_vertices, dtype=torch.bool, device=points.ends.device)
+    is_rim[hand.rig.rim] = True
+    is_used = ~is_rim[points.ends].all(-1)
+    return replace(
+        points,
+        ends=points.ends[is_used],
+        ratio=points.ratio[is_used],
+        lengths=points.lengths[is_used],
     )
-    best, best_value = pose, float("inf")
-    with torch.enable_grad():
-        for _ in range(steps + 1):
-            trial = HandPose(pose.rotations + change, pose.translation + shift)
-            coverage = soft_silhouette(rest.posed(trial).vertices, avatar.rig.faces, camera)
-            loss = silhouette_loss(coverage, small_mask)
-            # Keeps the pose plausible: an outline alone says little of what lies within it.
-            loss = loss + 0.1 * change.square().sum() + 100 * shift.square().sum()
-            if float(loss.detach()) < best_value:
-                best_value = float(loss.detach())
-                best = HandPose(trial.rotations.detach(), trial.translation.detach())
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-    return best
+
+
+def _smoothed(distance: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """Binomial filter of five pixels: the steps of the mask's border are not its shape."""
+    kernel = distance.new_tensor([1.0, 4, 6, 4, 1]) / 16
+    padded = torch.nn.functional.pad(distance[None, None], (2, 2, 2, 2), mode="replicate")
+    rows = torch.nn.functional.conv2d(padded, kernel[None, None, :, None])
+    return torch.nn.functional.conv2d(rows, kernel[None, None, None, :])[0, 0]
+
+
+def _sampled(
+    image: Float[Tensor, "height width"], pixels: Float[Tensor, "points 2"]
+) -> tuple[Float[Tensor, "points"], Float[Tensor, "points 2"]]:
+    """Bilinear values and their slopes over one pixel; beyond the picture its border goes on."""
+    size = pixels.new_tensor([image.shape[1], image.shape[0]])
+    half = pixels.new_tensor([[0, 0], [0.5, 0], [-0.5, 0], [0, 0.5], [0, -0.5]])
+    grid = (pixels + half[:, None]) / size * 2 - 1
+    values = torch.nn.functional.grid_sample(
+        image[None, None], grid[None], padding_mode="border", align_corners=False
+    )[0, 0]
+    return values[0], torch.stack([values[1] - values[2], values[3] - values[4]], dim=-1)
+
+
+def _overlap(
+    hand: ShapedHand, pose: HandPose, camera: Camera, mask: Bool[Tensor, "height width"]
+) -> float:
+    """Intersection over union of the posed hand and the mask."""
+    covered = rasterize(hand.posed(pose).vertices, hand.rig.faces, camera).mask
+    mask = mask.to(covered.device)
+    return int((covered & mask).sum()) / max(int((covered | mask).sum()), 1)

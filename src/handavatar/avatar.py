@@ -228,6 +228,7 @@ class HandAvatar(nn.Module):
     def moved_to(self, device: torch.device | str) -> "HandAvatar":
         """Moves weights, rig and parts; returns itself."""
         self.to(device)
+        self.base_rig = self.base_rig.to(device)
         self.rig = self.rig.to(device)
         self.parts = self.parts.to(device)
         return self
@@ -250,6 +251,11 @@ class HandAvatar(nn.Module):
     def personal(self, pose: HandPose) -> ShapedHand:
         """The personal rest hand of a pose (paper Sec. 3.1)."""
         rest = self.rig.shaped(self.coefficients)
+        return personal_hand(rest, self.shape(rest, pose.rotations))
+
+    def coarse_personal(self, pose: HandPose) -> ShapedHand:
+        """The same before subdivision: its outline is nearly the same and far cheaper."""
+        rest = self.base_rig.shaped(self.coefficients)
         return personal_hand(rest, self.shape(rest, pose.rotations))
 
     def prepare(self, pose: HandPose) -> HandState:

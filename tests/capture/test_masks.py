@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
@@ -14,6 +15,7 @@ from handavatar.capture.masks import (
     learn_colors,
     oklab_from_srgb,
     pixels_per_metre,
+    settled_border,
 )
 from handavatar.capture.outlines import silhouette
 from handavatar.capture.tracking import TrackedHand
@@ -55,6 +57,45 @@ def test_a_mixture_finds_two_clusters() -> None:
     order = np.argsort(mixture.means[:, 0])
     assert np.allclose(mixture.means[order], centers, atol=0.005)
     assert np.allclose(mixture.weights[order], [0.3, 0.7], atol=0.01)
+
+
+def _finger_with_coarse_color() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A picture whose colour lies three pixels beside its brightness; true and coloured mask."""
+    y, x = np.mgrid[:96, :96] + 0.5
+    true = np.hypot(x - 48, y - np.clip(y, 40, 96)) < 14
+    true |= np.hypot(x - 48, y - 40) < 14
+    to_yuv = np.array([[0.299, 0.587, 0.114], [-0.169, -0.331, 0.5], [0.5, -0.419, -0.081]])
+    skin, wall = to_yuv @ [190.0, 140, 115], to_yuv @ [105.0, 112, 120]
+    share = true.astype(float)
+    beside = ndimage.gaussian_filter(np.roll(share, 3, axis=1), 2.5)
+    shares = np.stack([share, beside, beside], axis=-1)
+    yuv = shares * skin + (1 - shares) * wall
+    image = (yuv @ np.linalg.inv(to_yuv).T).round().clip(0, 255).astype(np.uint8)
+    return image, true, beside > 0.5
+
+
+def test_the_border_settles_on_the_edge_of_brightness() -> None:
+    image, true, coloured = _finger_with_coarse_color()
+    settled = settled_border(image, coloured, np.zeros_like(true))
+
+    def wrong(mask: np.ndarray) -> int:
+        return int((mask ^ true).sum())
+
+    # Three pixels too far on one side and too near on the other, along some 70 rows each.
+    assert wrong(coloured) > 350
+    assert wrong(settled) < 30
+    # What is certainly background stays so, whatever it looks like.
+    wall = np.zeros_like(true)
+    wall[:50] = True
+    assert not settled_border(image, coloured & ~wall, wall)[:50].any()
+
+
+def test_where_skin_and_wall_look_alike_the_border_stays() -> None:
+    _, true, _ = _finger_with_coarse_color()
+    grey = np.full((*true.shape, 3), 128, dtype=np.uint8)
+    settled = settled_border(grey, true, np.zeros_like(true))
+    # The smoothing may cut the corners where the finger leaves the picture.
+    assert int((settled ^ true).sum()) < 12
 
 
 def _made_hand(number: int) -> tuple[TrackedHand, np.ndarray]:

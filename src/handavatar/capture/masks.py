@@ -2,7 +2,8 @@
 
 Two Gaussian mixtures in OKLab, one of skin and one of everything else, are learned from some
 thirty frames around the tracked landmarks. Their log-likelihood ratio starts GrabCut in every
-frame. The result holds the forearm as well; where the hand ends is decided by the fitted rig.
+frame. Last, the border moves to where the colours of its own neighbourhood change. The result holds
+the forearm as well; where the hand ends is decided by the fitted rig.
 """
 
 from collections.abc import Sequence
@@ -33,6 +34,19 @@ _FOREARM_HALF_ANGLE = 60.0
 _HOLE_RADIUS = 0.004
 _CUT_ROUNDS = 1
 _SURE = 4.0
+
+# The last correction of the border, in pixels of the window; noise in 8-bit steps.
+_BORDER_ROUNDS = 3
+_BORDER_REACH = 6.0
+_BORDER_GAP = 2.0
+_BORDER_CIRCLE = 3.5
+_BORDER_NOISE = 6.0
+_BORDER_SMOOTHING = 1.0
+_BORDER_INERTIA = 0.03
+# Brightness, and half of the two colour differences of ITU-R BT.601.
+_LUMA_AND_COLOR = np.array(
+    [[0.299, 0.587, 0.114], [-0.0844, -0.1656, 0.25], [0.25, -0.2094, -0.0406]], dtype=np.float32
+)
 
 _LMS_FROM_RGB = np.array(
     [
@@ -238,7 +252,9 @@ def find_mask(hand: TrackedHand, colors: ColorModel) -> HandMask:
     labels[(ratio > _SURE) & allowed] = _HAND
     labels[regions.core & (ratio > 0)] = _HAND
     cut = _graph_cut(hand.window.image, labels)
-    cleaned = _cleaned(cut, regions)
+    is_sure = labels == _BACKGROUND
+    settled = settled_border(hand.window.image, _cleaned(cut, regions) & ~is_sure, is_sure)
+    cleaned = _cleaned(settled, regions)
     reference = _cleaned(by_color, regions)
     union = (cleaned | reference) & regions.near
     agreement = (cleaned & reference & regions.near).sum() / max(1, int(union.sum()))
@@ -254,6 +270,54 @@ def pixels_per_metre(hand: TrackedHand) -> float:
     world = hand.world_landmarks[first] - hand.world_landmarks[second]
     flat = np.linalg.norm(world[:, :2], axis=-1)
     return float(picture.sum() / max(1e-6, flat.sum()))
+
+
+def settled_border(
+    image: UInt8[np.ndarray, "side side 3"],
+    mask: Bool[np.ndarray, "side side"],
+    is_background: Bool[np.ndarray, "side side"],
+) -> Bool[np.ndarray, "side side"]:
+    """The mask with its border where the picture changes from skin to what is beside it.
+
+    Videos store colour coarsely: its edges lie some pixels beside those of brightness, and a model
+    of the whole hand's colours follows them, fills the corners between fingers and thickens their
+    lit sides. Here every pixel near the border is compared with the skin and the background of its
+    own neighbourhood, brightness before colour; where the two look alike, its neighbours decide,
+    or the mask as it was.
+
+    Args:
+        image: sRGB.
+        mask: at most a few pixels wrong.
+        is_background: what is certainly no skin.
+    """
+    pixels = image.astype(np.float32) @ _LUMA_AND_COLOR.T
+    for _ in range(_BORDER_ROUNDS):
+        depth = ndimage.distance_transform_edt(mask)
+        height = ndimage.distance_transform_edt(~mask)
+        skin = _local_mean(pixels, depth > _BORDER_GAP)
+        beside = _local_mean(pixels, height > _BORDER_GAP)
+        apart = skin - beside
+        contrast = (apart**2).sum(-1)
+        share = (((pixels - beside) * apart).sum(-1) / (contrast + 1e-6)).clip(0, 1)
+        is_free = (depth <= _BORDER_REACH) & (height <= _BORDER_REACH) & ~is_background
+        trust = np.where(is_free, contrast / (contrast + _BORDER_NOISE**2), 1.0)
+        value = trust * np.where(is_free, share, mask) + _BORDER_INERTIA * mask
+        share = ndimage.gaussian_filter(value, _BORDER_SMOOTHING)
+        share /= ndimage.gaussian_filter(trust + _BORDER_INERTIA, _BORDER_SMOOTHING)
+        mask = np.where(is_free, share > 0.5, mask)
+    return mask
+
+
+def _local_mean(
+    values: Float[np.ndarray, "side side 3"], is_used: Bool[np.ndarray, "side side"]
+) -> Float[np.ndarray, "side side 3"]:
+    """Mean over the used pixels around each pixel; over a wider circle where none is near."""
+    total, weight = np.zeros_like(values), np.zeros(is_used.shape, dtype=values.dtype)
+    for sigma, share in ((_BORDER_CIRCLE, 1.0), (3 * _BORDER_CIRCLE, 1e-3)):
+        weights = is_used.astype(values.dtype)
+        weight += share * ndimage.gaussian_filter(weights, sigma)
+        total += share * ndimage.gaussian_filter(weights[..., None] * values, (sigma, sigma, 0))
+    return total / (weight[..., None] + 1e-12)
 
 
 # GrabCut's labels.

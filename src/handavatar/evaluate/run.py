@@ -26,6 +26,7 @@ from handavatar.evaluate.metrics import (
 )
 from handavatar.evaluate.perceptual import LpipsVgg, perceptual_loss
 from handavatar.evaluate.report import Curve, ReportRow, error_picture, picture, write_report
+from handavatar.hand.pose import HandPose
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,7 @@ def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
     for frame in frames:
         pose = frame.pose
         if is_tracked:
-            pose = aligned_pose(avatar, pose, frame.camera, frame.mask)
+            pose = _aligned(avatar, frame)
         rendering = _on_cpu(avatar.render(pose, frame.camera))
         renderings.append(rendering)
         judged.append(
@@ -95,6 +96,14 @@ def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
         metrics["notes"].append("poses of the judged frames were fitted to their masks")
     _write(out, metrics, capture, frames, renderings, judged, options)
     return metrics
+
+
+def _aligned(avatar: HandAvatar, frame: Frame) -> HandPose:
+    """Training corrects the poses of its own frames; held-out frames get the same chance."""
+    device = avatar.device
+    return aligned_pose(
+        avatar.coarse_personal, frame.pose.to(device), frame.camera.to(device), frame.mask
+    )
 
 
 def _opened(options: EvaluateOptions) -> tuple[HandAvatar, Capture, Path]:

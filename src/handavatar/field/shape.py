@@ -43,7 +43,8 @@ class ShapeOffsets(nn.Module):
             rotations: the pose, axis-angle; the wrist's is not used.
         """
         vertices = rest.rest_vertices
-        centre = rest.rig.template_vertices.mean(0)
+        # The joints' mean: the same for every resolution of a rig.
+        centre = (rest.rig.joint_regressor @ rest.rig.template_vertices).mean(0)
         encoded = positional_encoding((vertices - centre) / HAND_SCALE, NUM_FREQUENCIES)
         # The pose is the same for every vertex: its share of the first layer is a bias.
         first = cast(nn.Linear, self.mlp.hidden[0])

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -86,6 +87,58 @@ def silhouette_loss(
     intersection = coverage[mask].sum()
     union = coverage.sum() + mask.sum() - intersection
     return 1 - intersection / union if bool(union > 0) else union
+
+
+@dataclass(frozen=True, eq=False)
+class OutlinePoints:
+    """Points on the edges of a mesh that lie on its outline in the image.
+
+    Attributes:
+        ends: the vertices at the two ends of the point's edge.
+        ratio: where on the edge it lies: 0 at the first vertex, 1 at the second.
+        lengths: of the stretch of outline that it stands for, pixels.
+    """
+
+    ends: Int[Tensor, "points 2"]
+    ratio: Float[Tensor, "points"]
+    lengths: Float[Tensor, "points"]
+
+    def of(self, values: Float[Tensor, "vertices channels"]) -> Float[Tensor, "points channels"]:
+        """Values of the vertices, interpolated along the edges."""
+        first, second = values[self.ends].unbind(1)
+        return first + self.ratio[:, None] * (second - first)
+
+
+@torch.no_grad()
+def outline_points(
+    vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"], camera: Camera
+) -> OutlinePoints:
+    """A point on every pixel's length of the outline of the whole projected mesh.
+
+    Args:
+        vertices: metres, world.
+        faces: consistently wound; the mesh may be open.
+        camera: the view; parts outside the picture are left out.
+    """
+    pixels, depths = project(camera, vertices)
+    seen = faces[is_before_camera(depths[faces])]
+    pieces = _outline(pixels, seen, 0.0, camera.width, camera.height)
+    start, end = pieces.corners(pixels).unbind(1)
+    return OutlinePoints(pieces.ends, (pieces.low + pieces.high) / 2, (end - start).norm(dim=-1))
+
+
+def signed_distance(mask: Bool[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """Pixels from each pixel's centre to the border of a mask, negative inside.
+
+    A mask without a border is nowhere near: plus or minus the picture's size.
+    """
+    inside = mask.cpu().numpy()
+    if inside.all() or not inside.any():
+        return torch.full(mask.shape, float(sum(mask.shape))) * (-1.0 if inside.any() else 1.0)
+    # Neighbours across the border are one apart, and it runs between them.
+    away = distance_transform_edt(~inside) - distance_transform_edt(inside)
+    distance = torch.from_numpy(away).float()
+    return (distance - 0.5 * distance.sign()).to(mask.device)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,12 +5,12 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from handavatar.avatar import CheckpointError, HandAvatar, RenderSettings, chosen_device
@@ -19,24 +19,23 @@ from handavatar.capture.view import view_of
 from handavatar.evaluate.metrics import mean_color
 from handavatar.evaluate.perceptual import PerceptualLoss, perceptual_loss
 from handavatar.field.shading import OrientedCues, PaperCues
-from handavatar.field.shape import personal_hand
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
-from handavatar.geometry.meshes import is_inside, unique_edges
+from handavatar.geometry.meshes import is_inside
 from handavatar.hand.open_hand import load_open_hand
-from handavatar.hand.pose import HandPose
-from handavatar.hand.rig import PosedHand, RigError
-from handavatar.render.silhouette import resized_mask, silhouette_loss, soft_silhouette
+from handavatar.hand.rig import RigError
 from handavatar.train.appearance import SeenSamples, appearance_loss, find_seen_samples
 from handavatar.train.corrections import PoseCorrections
-from handavatar.train.losses import color_loss, occupancy_loss, offset_loss
+from handavatar.train.losses import color_loss, occupancy_loss
 from handavatar.train.optimizer_state import (
     optimizer_options,
     optimizer_tensors,
     restore_optimizer,
 )
+from handavatar.train.outlines import EdgeSet, corrected_pose, fit_outlines, shape_losses
 from handavatar.train.prior import SHIPPED_PRIOR, load_prior, sample_points
 from handavatar.train.progress import Progress
 from handavatar.train.runs import (
+    Checkpoint,
     Run,
     append_log,
     create_run,
@@ -58,9 +57,11 @@ class Method:
     Attributes:
         steps: optimisation steps.
         cues: what the illumination depends on: the paper's inputs, or these and the normal.
-        warm_steps: the first steps fit the shape to one silhouette each, and albedo and
-            illumination on samples of the prior's geometry, found once (``train.appearance``);
-            later steps recall these.
+        outline_rounds: before the first step, the poses of tracked captures and the shape are
+            drawn in turn to the outlines of all frames, so many times (``train.outlines``).
+        outline_visits: how often the shape sees every frame in one round.
+        warm_steps: the first steps fit albedo and illumination alone, on samples that are found
+            once (``train.appearance``); later steps recall these.
         warm_pixels: pixels per such step and per recall, from all frames.
         warm_stride: such steps know every so-manieth pixel in both directions.
         frames: frames per step.
@@ -75,7 +76,7 @@ class Method:
         lr_shape: learning rate of the shape offsets at the start.
         lr_codes: learning rate of the albedo codes at the start.
         lr_decoder: learning rate of the pair decoder at the start.
-        lr_pose: learning rate of the pose corrections at the start.
+        lr_pose: learning rate of the pose corrections at the start: radians; metres get a tenth.
         decay: all learning rates fall by this factor until the end, exponentially.
         occupancy_points: labelled points per frame for L_PairOF.
         occupancy_every: L_PairOF is taken at every so many steps.
@@ -90,6 +91,8 @@ class Method:
     num_samples: int
     silhouette_size: int
     cues: PaperCues | OrientedCues = field(default_factory=PaperCues)
+    outline_rounds: int = 3
+    outline_visits: int = 3
     warm_steps: int = 0
     warm_pixels: int = 2560
     warm_stride: int = 6
@@ -116,7 +119,7 @@ METHODS: dict[str, Method] = {
         patches=1,
         patch_size=32,
         num_samples=64,
-        silhouette_size=128,
+        silhouette_size=192,
         patch_strides=(1, 2, 4),
         perceptual_weight=0.1,
         lr=2e-3,
@@ -215,15 +218,17 @@ def train(options: TrainOptions) -> Path:
     training.avatar.info["view"] = view_of(frames)
     run = _open_or_create(options, capture, perceptual.name, steps)
     with locked(run), _stop_signals() as stopped:
-        # Before the checkpoint is loaded: the samples are those of the prior's geometry.
-        seen = _prior_samples(training, frames, method) if method.warm_steps else None
-        start = _restore(run, training)
-        edges = unique_edges(training.avatar.rig.faces)
+        checkpoint = latest_checkpoint(run)
+        outlines = _fit_or_restore_outlines(run, checkpoint, training, frames, method, options)
+        # Before the checkpoint is loaded: the samples are those of the geometry as it is now.
+        seen = _seen_samples(training, frames, method) if method.warm_steps else None
+        start = _restore(run, checkpoint, training)
+        edges = EdgeSet.of(training.avatar.rig)
         with Progress("train", steps, start) as progress:
             for step in range(start + 1, steps + 1):
                 _set_learning_rates(training.optimizer, method.decay ** ((step - 1) / steps))
                 if seen is not None and step <= method.warm_steps:
-                    figures = warm_step(training, frames, seen, edges, method, step, options.seed)
+                    figures = warm_step(training, seen, method, step, options.seed)
                 else:
                     figures = train_step(
                         training, frames, seen, edges, perceptual, method, step, options.seed
@@ -237,7 +242,7 @@ def train(options: TrainOptions) -> Path:
                 progress.update(step, psnr=figures["psnr"], loss=figures["loss"])
                 is_last = step == steps
                 if is_last or stopped() or step % options.checkpoint_every == 0:
-                    _save(run, training, step)
+                    _save(run, training, outlines, step)
                 if stopped() and not is_last:
                     raise Interrupted(f"stopped at step {step}; continue with --resume auto")
     training.avatar.save(run.avatar)
@@ -292,14 +297,63 @@ def begin_training(
     ]
     if corrections is not None:
         corrections.to(device)
-        groups.append({"params": list(corrections.parameters()), "lr": method.lr_pose})
+        groups += [
+            {"params": list(corrections.rotations), "lr": method.lr_pose},
+            {"params": list(corrections.translations), "lr": 0.1 * method.lr_pose},
+        ]
     for group in groups:
         group["initial_lr"] = group["lr"]
     return Training(avatar, corrections, torch.optim.Adam(groups))
 
 
-def _prior_samples(training: Training, frames: list[Frame], method: Method) -> SeenSamples:
+def _fit_or_restore_outlines(
+    run: Run,
+    checkpoint: Checkpoint | None,
+    training: Training,
+    frames: list[Frame],
+    method: Method,
+    options: TrainOptions,
+) -> dict[str, Tensor]:
+    """Sets shape and poses as the outlines alone would have them, and returns these."""
+    modules = _outline_modules(training)
+    if checkpoint is None:
+        fit_outlines(
+            training.avatar,
+            training.corrections,
+            frames,
+            method.outline_rounds,
+            method.outline_visits,
+            method.silhouette_size,
+            options.seed,
+        )
+        tensors = {
+            f"{prefix}{name}": value.clone()
+            for prefix, module in modules.items()
+            for name, value in module.state_dict().items()
+        }
+        _save(run, training, tensors, 0)
+        return tensors
+    tensors = load_checkpoint(checkpoint).tensors["outlines"]
+    for prefix, module in modules.items():
+        module.load_state_dict(_named(tensors, prefix))
+    return tensors
+
+
+def _outline_modules(training: Training) -> dict[str, torch.nn.Module]:
+    modules: dict[str, torch.nn.Module] = {"shape.": training.avatar.shape}
+    if training.corrections is not None:
+        modules["corrections."] = training.corrections
+    return modules
+
+
+def _seen_samples(training: Training, frames: list[Frame], method: Method) -> SeenSamples:
     settings = RenderSettings(num_samples=method.num_samples)
+    with torch.no_grad():
+        poses = [
+            corrected_pose(training.corrections, frame, number, training.avatar.device)
+            for number, frame in enumerate(frames)
+        ]
+    frames = [replace(frame, pose=pose) for frame, pose in zip(frames, poses, strict=True)]
     return find_seen_samples(training.avatar, frames, settings, method.warm_stride)
 
 
@@ -311,70 +365,23 @@ def _some_pixels(
 
 
 def warm_step(
-    training: Training,
-    frames: list[Frame],
-    seen: SeenSamples,
-    edges: Int[Tensor, "edges 2"],
-    method: Method,
-    step: int,
-    seed: int,
+    training: Training, seen: SeenSamples, method: Method, step: int, seed: int
 ) -> dict[str, float]:
-    """One optimiser step of appearance on ``seen``, and of the shape on one frame's silhouette."""
+    """One optimiser step of the appearance alone, on ``seen``."""
     generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
     training.optimizer.zero_grad(set_to_none=True)
     color, squared = appearance_loss(training.avatar, seen, _some_pixels(seen, method, generator))
-    number = _frame_number(len(frames), step - 1, seed)
-    pose, losses = _corrected_pose(training, frames[number], number)
-    rest = training.avatar.rig.shaped(training.avatar.coefficients)
-    offsets = training.avatar.shape(rest, pose.rotations)
-    posed = personal_hand(rest, offsets).posed(pose)
-    losses |= shape_losses(posed, offsets, frames[number], edges, method)
-    losses["color"] = color
-    total = torch.stack(list(losses.values())).sum()
-    total.backward()
+    color.backward()
     training.optimizer.step()
-    figures = {name: float(value.detach()) for name, value in losses.items()}
     psnr = -10 * math.log10(max(float(squared), 1e-10))
-    return figures | {"loss": float(total.detach()), "psnr": psnr}
-
-
-def _corrected_pose(
-    training: Training, frame: Frame, number: int
-) -> tuple[HandPose, dict[str, Tensor]]:
-    """The frame's pose as training sees it, and what its correction costs."""
-    pose = frame.pose.to(training.avatar.device)
-    if training.corrections is None:
-        return pose, {}
-    penalty = 0.01 * training.corrections.penalty(number)
-    return training.corrections(number, pose), {"pose": penalty}
-
-
-def shape_losses(
-    posed: PosedHand,
-    offsets: Float[Tensor, "vertices 3"],
-    frame: Frame,
-    edges: Int[Tensor, "edges 2"],
-    method: Method,
-) -> dict[str, Tensor]:
-    """L_shape on a small mask, and what keeps the personal offsets smooth.
-
-    Source: paper Sec. 3.1, L_shape.
-    """
-    size = method.silhouette_size
-    camera = frame.camera.to(posed.vertices.device).resized(size, size)
-    mask = resized_mask(frame.mask, size).to(posed.vertices.device)
-    coverage = soft_silhouette(posed.vertices, posed.rig.faces, camera)
-    return {
-        "silhouette": silhouette_loss(coverage, mask),
-        "offsets": 0.1 * offset_loss(offsets, edges),
-    }
+    return {"color": float(color.detach()), "loss": float(color.detach()), "psnr": psnr}
 
 
 def train_step(
     training: Training,
     frames: list[Frame],
     seen: SeenSamples | None,
-    edges: Int[Tensor, "edges 2"],
+    edges: EdgeSet,
     perceptual: PerceptualLoss,
     method: Method,
     step: int,
@@ -417,7 +424,7 @@ def frame_losses(
     training: Training,
     frame: Frame,
     number: int,
-    edges: Int[Tensor, "edges 2"],
+    edges: EdgeSet,
     perceptual: PerceptualLoss,
     method: Method,
     step: int,
@@ -426,9 +433,11 @@ def frame_losses(
     """All losses of one frame; ``squared_error`` beside them for the record."""
     avatar = training.avatar
     device = avatar.device
-    pose, losses = _corrected_pose(training, frame, number)
+    pose = corrected_pose(training.corrections, frame, number, device)
     state = avatar.prepare(pose)
-    losses |= shape_losses(state.posed, state.offsets, frame, edges, method)
+    losses = shape_losses(state.posed, state.offsets, frame, edges, method.silhouette_size)
+    if training.corrections is not None:
+        losses["pose"] = 0.01 * training.corrections.penalty(number)
     camera = frame.camera.to(device)
 
     if step % method.occupancy_every == 0:
@@ -562,18 +571,21 @@ def _require_same_training(run: Run, options: TrainOptions, capture: Capture) ->
             )
 
 
-def _save(run: Run, training: Training, step: int) -> None:
+def _save(run: Run, training: Training, outlines: dict[str, Tensor], step: int) -> None:
     model = {f"avatar.{name}": value for name, value in training.avatar.state_dict().items()}
     if training.corrections is not None:
         state = training.corrections.state_dict()
         model |= {f"corrections.{name}": value for name, value in state.items()}
-    tensors = {"model": model, "optimizer": optimizer_tensors(training.optimizer)}
+    tensors = {
+        "model": model,
+        "optimizer": optimizer_tensors(training.optimizer),
+        "outlines": outlines,
+    }
     save_checkpoint(run, step, tensors, optimizer_options(training.optimizer))
 
 
-def _restore(run: Run, training: Training) -> int:
-    """Loads the newest whole checkpoint, if any; returns its step."""
-    checkpoint = latest_checkpoint(run)
+def _restore(run: Run, checkpoint: Checkpoint | None, training: Training) -> int:
+    """Loads the checkpoint, if any; returns its step."""
     if checkpoint is None:
         truncate_log(run, 0)
         return 0

@@ -1,0 +1,174 @@
+"""Before the first step: poses and personal shape, drawn in turn to the outlines of all frames.
+
+Colours are only learned where they belong once the mesh lies on the picture. On the coarse mesh,
+whose outline is nearly that of the fine one, a frame costs a twentieth of a joint step.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from handavatar.alignment import aligned_pose
+from handavatar.avatar import HandAvatar
+from handavatar.capture.frames import Frame
+from handavatar.field.shape import personal_hand
+from handavatar.geometry.meshes import unique_edges
+from handavatar.hand.pose import HandPose
+from handavatar.hand.rig import PosedHand, Rig
+from handavatar.render.silhouette import resized_mask, silhouette_loss, soft_silhouette
+from handavatar.train.corrections import PoseCorrections
+from handavatar.train.losses import offset_loss
+from handavatar.train.progress import Progress
+
+# Frames per step of the shape; its learning rate falls to a tenth.
+_BATCH = 4
+_RATE = 4e-3
+# Gauss-Newton steps per frame and round.
+_ALIGNMENT_STEPS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeSet:
+    """Edges of a rig's mesh, for the smoothness of offsets.
+
+    Attributes:
+        edges: each once.
+        spacing: their mean length in the template, metres.
+    """
+
+    edges: Int[Tensor, "edges 2"]
+    spacing: float
+
+    @classmethod
+    def of(cls, rig: Rig) -> "EdgeSet":
+        """Of a rig's template."""
+        edges = unique_edges(rig.faces)
+        start, end = rig.template_vertices[edges].unbind(1)
+        return cls(edges, float((end - start).norm(dim=-1).mean()))
+
+
+def shape_losses(
+    posed: PosedHand, offsets: Float[Tensor, "vertices 3"], frame: Frame, edges: EdgeSet, size: int
+) -> dict[str, Tensor]:
+    """L_shape on a small mask, and what keeps the personal offsets smooth.
+
+    Args:
+        posed: the personal hand in the frame.
+        offsets: of its rest vertices, metres.
+        frame: with mask and camera.
+        edges: of the same mesh.
+        size: pixels along a side of the compared masks.
+
+    Source: paper Sec. 3.1, L_shape.
+    """
+    device = posed.vertices.device
+    camera = frame.camera.to(device).resized(size, size)
+    coverage = soft_silhouette(posed.vertices, posed.rig.faces, camera)
+    return {
+        "silhouette": silhouette_loss(coverage, resized_mask(frame.mask, size).to(device)),
+        "offsets": offset_loss(offsets, edges.edges, edges.spacing),
+    }
+
+
+def fit_outlines(
+    avatar: HandAvatar,
+    corrections: PoseCorrections | None,
+    frames: list[Frame],
+    rounds: int,
+    visits: int,
+    size: int,
+    seed: int,
+) -> None:
+    """Moves the avatar's shape, and the corrections, towards the masks of all frames.
+
+    Args:
+        avatar: only its shape offsets change.
+        corrections: of tracked poses; None where poses are known exactly.
+        frames: of training.
+        rounds: poses, then shape, so many times; the poses once more at the end.
+        visits: of every frame by the shape in one round.
+        size: pixels along a side of the compared masks.
+        seed: of the order of the frames.
+
+    Departs: the authors start all losses at once.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    edges = EdgeSet.of(avatar.base_rig)
+    optimizer = torch.optim.Adam(avatar.shape.parameters(), lr=_RATE, betas=(0.9, 0.99))
+    passes = rounds * visits + (rounds + 1 if corrections else 0) * (rounds > 0)
+    steps = rounds * visits * -(-len(frames) // _BATCH)
+    falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.1 ** (1 / max(steps, 1)))
+    with Progress("outlines", passes * len(frames)) as progress:
+        done = 0
+        for _ in range(rounds):
+            if corrections is not None:
+                done = _align(avatar, corrections, frames, progress, done)
+            for _ in range(visits):
+                order = torch.randperm(len(frames), generator=generator)
+                for chosen in order.split(_BATCH):
+                    optimizer.zero_grad()
+                    values = [
+                        _backward(avatar, corrections, frames, number, edges, size, len(chosen))
+                        for number in chosen.tolist()
+                    ]
+                    optimizer.step()
+                    falling.step()
+                    done += len(chosen)
+                    progress.update(done, silhouette=sum(values) / len(values))
+        if corrections is not None and rounds > 0:
+            _align(avatar, corrections, frames, progress, done)
+    optimizer.zero_grad(set_to_none=True)
+
+
+def corrected_pose(
+    corrections: PoseCorrections | None, frame: Frame, number: int, device: torch.device
+) -> HandPose:
+    """The frame's pose as training sees it."""
+    pose = frame.pose.to(device)
+    return pose if corrections is None else corrections(number, pose)
+
+
+def _align(
+    avatar: HandAvatar,
+    corrections: PoseCorrections,
+    frames: list[Frame],
+    progress: Progress,
+    done: int,
+) -> int:
+    for number, frame in enumerate(frames):
+        pose = frame.pose.to(avatar.device)
+        with torch.no_grad():
+            start = corrections(number, pose)
+        found = aligned_pose(
+            avatar.coarse_personal,
+            pose,
+            frame.camera.to(avatar.device),
+            frame.mask,
+            _ALIGNMENT_STEPS,
+            start,
+        )
+        corrections.set(number, pose, found)
+        progress.update(done + number + 1)
+    return done + len(frames)
+
+
+def _backward(
+    avatar: HandAvatar,
+    corrections: PoseCorrections | None,
+    frames: list[Frame],
+    number: int,
+    edges: EdgeSet,
+    size: int,
+    share: int,
+) -> float:
+    """Adds one frame's gradient to that of the shape; returns its silhouette loss."""
+    frame = frames[number]
+    with torch.no_grad():
+        pose = corrected_pose(corrections, frame, number, avatar.device)
+    rest = avatar.base_rig.shaped(avatar.coefficients)
+    offsets = avatar.shape(rest, pose.rotations)
+    losses = shape_losses(personal_hand(rest, offsets).posed(pose), offsets, frame, edges, size)
+    (torch.stack(list(losses.values())).sum() / share).backward()
+    return float(losses["silhouette"].detach())
