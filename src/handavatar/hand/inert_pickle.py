@@ -12,8 +12,8 @@ import struct
 from dataclasses import dataclass
 from typing import Any
 
-MAX_INSTRUCTIONS = 1_000_000
-"""A MANO file has a few thousand."""
+MAX_INSTRUCTIONS = 200_000
+"""A MANO file has a few hundred."""
 _MAX_INTEGER_BYTES = 16
 _MAX_LINE_OF_NUMBER = 40
 
@@ -257,7 +257,7 @@ class _Reader:
     def _named(self, module: str, name: str) -> GlobalName:
         dotted = f"{module}.{name}"
         if dotted not in self._allowed:
-            raise PickleError(f"it names {_shown(dotted)}")
+            raise PickleError(f"it names {_shown(dotted)}, which has no place in it")
         return GlobalName(dotted)
 
     def _set_items(self, members: list[Any]) -> None:

@@ -97,7 +97,8 @@ class Rig:
                 f"rig {self.name}: faces name vertices {int(self.faces.min())} to "
                 f"{int(self.faces.max())}, but there are {num_vertices}"
             )
-        if not torch.allclose(self.skin_weights.sum(-1), torch.ones(()), atol=1e-4):
+        sums = self.skin_weights.sum(-1)
+        if not torch.allclose(sums, torch.ones_like(sums), atol=1e-4):
             raise RigError(f"rig {self.name}: rows of skin_weights do not sum to 1")
 
     @property
