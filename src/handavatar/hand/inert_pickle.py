@@ -8,11 +8,12 @@ and old-style instances. Work and memory are bounded by the size of the file.
 """
 
 import codecs
+import re
 import struct
 from dataclasses import dataclass
 from typing import Any
 
-MAX_INSTRUCTIONS = 200_000
+MAX_INSTRUCTIONS = 20_000
 """A MANO file has a few hundred."""
 _MAX_INTEGER_BYTES = 16
 _MAX_LINE_OF_NUMBER = 40
@@ -42,6 +43,10 @@ _COUNTED: dict[bytes, tuple[int, str]] = {
     b"\x8e": (8, ""),
 }
 _INTEGERS = {b"K": "<B", b"M": "<H", b"J": "<i"}
+# What Python 2 writes between quotes.
+_ESCAPED = re.compile(
+    rb"""(?:[^\\]|\\(?:[\\'"abfnrtv]|x[0-9a-fA-F]{2}|[0-3][0-7]{2}))*""", re.DOTALL
+)
 _INDEX_SIZES = {b"h": 1, b"j": 4, b"q": 1, b"r": 4}
 
 
@@ -337,10 +342,9 @@ def _quoted(line: bytes) -> str:
     """Python 2's text in quotes with escapes, as Latin-1."""
     if len(line) < 2 or line[:1] != line[-1:] or line[:1] not in (b"'", b'"'):
         raise PickleError("it contains text without quotes")
-    try:
-        return codecs.escape_decode(line[1:-1])[0].decode("latin-1")
-    except ValueError as error:
-        raise PickleError("it contains text with a broken escape") from error
+    if not _ESCAPED.fullmatch(line, 1, len(line) - 1):
+        raise PickleError("it contains text with a broken escape")
+    return codecs.escape_decode(line[1:-1])[0].decode("latin-1")
 
 
 def _integer(line: bytes) -> int | bool:
