@@ -1,6 +1,7 @@
 """What several tests need: a small avatar, and a capture of a few small pictures."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,7 @@ from handavatar.geometry.cameras import Camera, look_at
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import NUM_BONES, HandPose
+from handavatar.hand.rig import Rig
 from handavatar.render.rasterize import interpolate, rasterize
 from handavatar.train.loop import Method
 from handavatar.train.prior import load_prior
@@ -53,10 +55,14 @@ def camera_above(size: int, distance: float = 0.42) -> Camera:
     return Camera((1.7 * size, 1.7 * size), (size / 2, size / 2), size, size, placed)
 
 
-def lit_frame(index: int, split: str, confidence: float = 1.0, size: int = 48) -> Frame:
-    """The rasterised open hand, skin-coloured, under one light."""
+def lit_frame(
+    index: int, split: str, confidence: float = 1.0, size: int = 48, rig: Rig | None = None
+) -> Frame:
+    """The rasterised open hand, or that of another rig, skin-coloured, under one light."""
     pose, camera = bent_pose(index), camera_above(size)
-    posed = load_open_hand().shaped().posed(pose)
+    if rig is not None:  # Its wrist may lie elsewhere.
+        pose = replace(pose, translation=pose.translation - rig.shaped().rest_joints[0])
+    posed = (rig or load_open_hand()).shaped().posed(pose)
     faces = posed.rig.faces
     fragments = rasterize(posed.vertices, faces, camera)
     normals = interpolate(fragments, faces, vertex_normals(posed.vertices, faces))
@@ -75,14 +81,18 @@ def lit_frame(index: int, split: str, confidence: float = 1.0, size: int = 48) -
 
 
 def write_tiny_capture(
-    folder: Path, splits: str = "aaabb", confidence: float = 1.0, **header: str
+    folder: Path,
+    splits: str = "aaabb",
+    confidence: float = 1.0,
+    rig: Rig | None = None,
+    **header: str,
 ) -> Path:
     """A capture of 48 x 48 pictures: ``a`` stands for a training frame, ``b`` for a test frame."""
-    rig = load_open_hand()
     frames = [
-        lit_frame(index, {"a": "train", "b": "test"}[letter], confidence)
+        lit_frame(index, {"a": "train", "b": "test"}[letter], confidence, rig=rig)
         for index, letter in enumerate(splits)
     ]
+    rig = rig or load_open_hand()
     facts = dict(
         rig_name=rig.name,
         rig_sha256=rig.sha256,

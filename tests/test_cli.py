@@ -56,7 +56,7 @@ def test_every_command_has_help(command: str, capsys: pytest.CaptureFixture[str]
         (["capture"], "capture check"),
         (["capture", "vidoe"], "did you mean 'handavatar capture video'"),
         (["capture", "check"], "CAPTURE"),
-        (["rig", "info", "--level", "7"], "'full', '778'"),
+        (["rig", "import-mano", "a.pkl", "--left-shape", "x"], "'kept', 'mirrored'"),
         (["rig", "info", "--lvl", "full"], "--lvl"),
     ],
 )
@@ -114,7 +114,7 @@ def test_errors_become_exit_codes_and_a_few_lines(
 
 
 def test_rig_info_prints_one_json_object(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["rig", "info", "--level", "778", "--json"]) == 0
+    assert cli.main(["rig", "info", "--rig", "open-hand-778", "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert facts["vertices"] == 778 and facts["bones"] == 16
     # The paper's counts (Sec. 3.1).

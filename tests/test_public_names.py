@@ -19,8 +19,13 @@ EXACTLY = {
         "BONE_NAMES BONE_PARENTS CONNECTED_PAIRS FINGER_BONES HandPose NUM_BONES "
         "bone_transforms linear_blend_skinning"
     ),
-    "hand.rig": "PosedHand Rig RigError ShapedHand",
+    "hand.rig": "LicensedRigMissing PosedHand Rig RigError ShapedHand",
     "hand.open_hand": "Level load_open_hand",
+    "hand.mano": (
+        "FINGERTIPS LICENCE LeftShape ManoModel Side WHERE_TO_GET_IT absolute_rotations "
+        "growth_agreement read_mano"
+    ),
+    "hand.rigs": "SCHEMA find_rig load_rig read_rig rigs_folder save_rig",
     "hand.detail": "subdivided",
     "edit": "Edit bones_named",
     "avatar": (

@@ -80,7 +80,9 @@ def _stepped(
     distance: Float[Tensor, "height width"],
 ) -> HandPose:
     """One Gauss-Newton step from ``current``."""
-    rest, weights = points.of(hand.rest_vertices), points.of(hand.rig.skin_weights)
+    # What the pose adds to the rest vertices hardly changes within a step.
+    rest = points.of(hand.rest_vertices + hand.rig.pose_offsets(current.rotations))
+    weights = points.of(hand.rig.skin_weights)
 
     def seen(values: Float[Tensor, "unknowns"]) -> Float[Tensor, "points 2"]:
         rotations, translation = values[:-3].reshape(-1, 3), values[-3:]

@@ -34,6 +34,7 @@ from handavatar.hand.detail import subdivided
 from handavatar.hand.parts import Parts, divide_into_parts
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, Rig, ShapedHand
+from handavatar.hand.rigs import find_rig
 from handavatar.render.rasterize import rasterize
 from handavatar.render.sampling import depths_along, intervals_through_boxes
 from handavatar.render.volume import composite_sparse, visibility
@@ -51,6 +52,16 @@ _RIG_TENSORS = (
     "uv_faces",
     "joint_axes",
 )
+_OF_LICENSED_RIG = ("illumination.position_codes",)
+"""Weights that a licensed rig's arrays could be read from; they follow from the rig."""
+
+
+def _stored_rig(name: str, tensors: dict[str, Tensor]) -> Rig:
+    sets = {key[4:]: value for key, value in tensors.items() if key.startswith("set.")}
+    arrays: dict[str, Any] = {key: tensors[f"rig.{key}"] for key in _RIG_TENSORS}
+    if "rig.pose_directions" in tensors:
+        arrays["pose_directions"] = tensors["rig.pose_directions"]
+    return Rig(name=name, vertex_sets=sets, **arrays)
 
 
 def chosen_device(name: str) -> torch.device:
@@ -474,14 +485,24 @@ class HandAvatar(nn.Module):
         return grown[0, 0] > 0
 
     def save(self, path: Path) -> None:
-        """Writes one safetensors file, aside first, then renamed into place."""
-        tensors = {f"rig.{name}": getattr(self.base_rig, name) for name in _RIG_TENSORS}
-        tensors |= {f"set.{name}": value for name, value in self.base_rig.vertex_sets.items()}
-        tensors |= {f"avatar.{name}": value for name, value in self.state_dict().items()}
+        """Writes one safetensors file, aside first, then renamed into place.
+
+        Of a licensed rig it holds only name and fingerprint.
+        """
+        tensors = {f"avatar.{name}": value for name, value in self.state_dict().items()}
+        if self.base_rig.is_licensed:
+            for name in _OF_LICENSED_RIG:
+                del tensors[f"avatar.{name}"]
+        else:
+            tensors |= {f"rig.{name}": getattr(self.base_rig, name) for name in _RIG_TENSORS}
+            tensors |= {f"set.{name}": value for name, value in self.base_rig.vertex_sets.items()}
+            if self.base_rig.pose_directions.numel():
+                tensors["rig.pose_directions"] = self.base_rig.pose_directions
         about = {
             "schema": SCHEMA,
             "rig": self.base_rig.name,
             "rig_sha256": self.base_rig.sha256,
+            "rig_is_licensed": self.base_rig.is_licensed,
             "rounds": self.rounds,
             "margin": self.occupancy.margin,
             "softness": self.occupancy.softness,
@@ -503,6 +524,7 @@ class HandAvatar(nn.Module):
 
         Raises:
             CheckpointError: if the file is missing, damaged, or not an avatar of this schema.
+            RigError: if it was made with a licensed rig that is not imported here.
         """
         path = Path(path)
         if path.is_dir():
@@ -527,10 +549,11 @@ class HandAvatar(nn.Module):
             raise CheckpointError(
                 f"{path}: not an avatar of schema {SCHEMA}; train it again with this version"
             )
+        licensed_rig: Rig | None = None
+        if about.get("rig_is_licensed"):
+            licensed_rig = find_rig(str(about.get("rig_sha256")), str(about.get("rig")))
         try:
-            sets = {name[4:]: value for name, value in tensors.items() if name.startswith("set.")}
-            arrays = {name: tensors[f"rig.{name}"] for name in _RIG_TENSORS}
-            rig = Rig(name=about["rig"], vertex_sets=sets, **arrays)
+            rig = licensed_rig or _stored_rig(about["rig"], tensors)
             state = {name[7:]: v for name, v in tensors.items() if name.startswith("avatar.")}
             anchors = SurfacePoints(state["anchor_corners"], state["anchor_barycentric"])
             avatar = HandAvatar(
@@ -543,6 +566,8 @@ class HandAvatar(nn.Module):
             )
             avatar.occupancy.margin = about["margin"]
             avatar.occupancy.softness = about["softness"]
+            if rig.is_licensed:
+                state |= {name: avatar.state_dict()[name] for name in _OF_LICENSED_RIG}
             avatar.load_state_dict(state)
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
             raise CheckpointError(f"{path}: not a complete avatar ({error})") from error

@@ -90,7 +90,10 @@ class HandModel:
         return self._joints + self._joint_directions @ shape
 
     def landmarks(self, fit: HandFit) -> Float[Tensor, "frames 21 3"]:
-        """Where the tracker's landmarks are on the hand: metres, camera axes."""
+        """Where the tracker's landmarks are on the hand: metres, camera axes.
+
+        Without pose blend shapes: what they move at a fingertip is within ``offset_tolerance``.
+        """
         joints = self.joints(fit.shape_coefficients)
         transforms = bone_transforms(fit.rotations, joints)[:, self.landmark_bones]
         rest = self._landmarks + self._landmark_directions @ fit.shape_coefficients + fit.offsets
@@ -110,6 +113,9 @@ class HandModel:
         motion = torch.cat([rotation.flatten(-2), shift], dim=-1)
         per_vertex = rig.skin_weights[chosen] @ motion
         rest = (rig.template_vertices + rig.shape_directions @ shape)[chosen]
+        if rig.pose_directions.numel():
+            added = rig.pose_offsets(fit.rotations)
+            rest = rest + added.gather(1, chosen[..., None].expand(-1, -1, 3))
         blended = per_vertex[..., :9].unflatten(-1, (3, 3))
         return (blended @ rest[..., None])[..., 0] + per_vertex[..., 9:] + fit.translation[:, None]
 
@@ -120,7 +126,7 @@ class HandModel:
         rest = self.rig.template_vertices + self.rig.shape_directions @ fit.shape_coefficients
         frames = len(fit.rotations)
         posed = linear_blend_skinning(
-            rest.expand(frames, -1, -1),
+            rest.expand(frames, -1, -1) + self.rig.pose_offsets(fit.rotations),
             self.rig.skin_weights,
             bone_transforms(fit.rotations, joints),
             joints.expand(frames, -1, -1),

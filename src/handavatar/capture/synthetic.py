@@ -54,7 +54,6 @@ from handavatar.geometry.cameras import Camera, look_at, project
 from handavatar.geometry.meshes import uniform_laplacian, unique_edges, vertex_normals
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.detail import subdivided
-from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import FINGER_BONES
 from handavatar.hand.pose_sampling import (
     interpolate_rotations,
@@ -62,6 +61,7 @@ from handavatar.hand.pose_sampling import (
     sample_poses,
 )
 from handavatar.hand.rig import Rig
+from handavatar.hand.rigs import load_rig
 
 TRAINING_GESTURES = (
     "relaxed",
@@ -116,6 +116,8 @@ class SynthOptions:
     """store depth and normals too, not only albedo and shading"""
     variant: Variant = "auto"
     """of Mitsuba; auto takes llvm_ad_rgb where it works"""
+    rig: str = "open-hand"
+    """the hand: open-hand, an imported one (mano-right) or its file"""
 
     def __post_init__(self) -> None:
         """Refuses what cannot be rendered."""
@@ -133,7 +135,7 @@ class Subject:
     """A hand that is fully known.
 
     Attributes:
-        rig: the refined open hand.
+        rig: the refined hand.
         shape_coefficients: standard deviations.
         plain_vertices: rest hand of these coefficients, metres.
         rest_vertices: the same with the personal displacement, metres.
@@ -170,7 +172,7 @@ def make_capture(
         CaptureError: if Mitsuba is missing or the folder is in use.
     """
     choose_variant(options.variant)
-    base = load_open_hand()
+    base = load_rig(options.rig)
     # What can be refused is refused before the slow work begins.
     writer = CaptureWriter(
         folder,

@@ -36,8 +36,8 @@ from handavatar.capture.outlines import (
 from handavatar.capture.tracking import Track, TrackedHand, track_hand
 from handavatar.capture.windows import resampled, window_camera
 from handavatar.geometry.cameras import project
-from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.rig import Rig
+from handavatar.hand.rigs import load_rig
 
 Progress = Callable[[float, str], None]
 """Told the share of the work that is done, in [0, 1], and what is being done."""
@@ -76,6 +76,8 @@ class VideoOptions:
     """Terms under which the video may be used."""
     overwrite: bool = False
     """Replace a capture that is already in the folder."""
+    rig: str = "open-hand"
+    """The hand to lay onto the pictures: open-hand, an imported one (mano-right) or its file."""
     fit: FitOptions = field(default_factory=FitOptions)
     """How the hand is fitted."""
 
@@ -107,7 +109,7 @@ def capture_video(
 
     Args:
         options: which video, where to, how.
-        rig: the hand to lay onto the pictures; the open hand if None.
+        rig: the hand to lay onto the pictures; the one that the options name if None.
         progress: called now and then.
 
     Returns:
@@ -118,7 +120,7 @@ def capture_video(
         CaptureError: the video cannot be used, the folder is in use, or an extra is missing.
     """
     report = progress or (lambda share, doing: None)
-    rig = rig or load_open_hand()
+    rig = rig or load_rig(options.rig)
     header = {
         "rig_name": rig.name,
         "rig_sha256": rig.sha256,

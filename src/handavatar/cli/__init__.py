@@ -22,6 +22,7 @@ COMMANDS: dict[str, Command] = {
     "capture synth": capture.synth,
     "capture check": capture.check,
     "rig info": rig.info,
+    "rig import-mano": rig.import_mano,
     "prior train": prior.train,
     "prior evaluate": prior.evaluate,
     "train": avatar.train,

@@ -64,6 +64,8 @@ def explanation(error: BaseException) -> tuple[int, str]:
         return BAD_DATA, f"{where}{error.strerror or text}"
     if isinstance(error, FloatingPointError):
         return NUMERICAL, text
+    if type(error).__name__ == "LicensedRigMissing":
+        return LICENSED_FILE_MISSING, text
     # RigError, CaptureError, CheckpointError: the kinds that a user's file can cause.
     if isinstance(error, ValueError) and type(error).__module__.startswith("handavatar."):
         return BAD_DATA, text

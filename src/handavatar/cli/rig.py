@@ -1,40 +1,89 @@
-"""``handavatar rig``: facts of a rig."""
+"""``handavatar rig``: facts of a rig, and a user's own MANO file made into one."""
 
 from dataclasses import dataclass
-from typing import Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from handavatar.hand.rig import Rig
 
 
 @dataclass(frozen=True)
 class _InfoOptions:
-    """Prints the facts of the open hand.
+    """Prints the facts of a rig.
 
     Attributes:
-        level: ``full`` is the default rig, ``778`` the one of MANO's size.
+        rig: ``open-hand`` is the default rig, ``open-hand-778`` the one of MANO's size; else the
+            name of an imported rig, or its file.
     """
 
-    level: Literal["full", "778"] = "full"
+    rig: str = "open-hand"
 
 
 def info(words: list[str]) -> int:
-    """Facts of the shipped rig: counts, size, fingerprint."""
+    """Facts of a rig: counts, size, fingerprint."""
     from handavatar.cli.arguments import JSON, parse_with, print_figures, print_json
-    from handavatar.hand.detail import subdivided
-    from handavatar.hand.open_hand import load_open_hand
+    from handavatar.hand.rigs import load_rig
 
     options, extras = parse_with(_InfoOptions, (JSON,), words, "rig info")
-    rig = load_open_hand(options.level)
+    facts = _facts(load_rig(options.rig))
+    (print_json if extras["json"] else print_figures)(facts)
+    return 0
+
+
+@dataclass(frozen=True)
+class _ImportOptions:
+    """Converts a user's own MANO file once, without running anything in it.
+
+    Attributes:
+        file: ``MANO_RIGHT.pkl`` or ``MANO_LEFT.pkl`` from https://mano.is.tue.mpg.de.
+        out: safetensors file to write; by default one in ``~/.local/share/handavatar/rigs`` (or
+            ``$HANDAVATAR_HOME/rigs``), where captures and avatars find it again.
+        left_shape: the released left hand's shape directions have the wrong sign in x;
+            ``mirrored`` mends them, ``kept`` leaves them, ``auto`` looks whether they need it.
+    """
+
+    file: Path
+    out: Path | None = None
+    left_shape: Literal["auto", "kept", "mirrored"] = "auto"
+
+
+def import_mano(words: list[str]) -> int:
+    """Convert a user's MANO file once, safely."""
+    from handavatar.cli.arguments import JSON, OVERWRITE, parse_with, print_figures, print_json
+    from handavatar.hand.mano import LICENCE, read_mano
+    from handavatar.hand.rigs import save_rig
+
+    options, extras = parse_with(
+        _ImportOptions, (JSON, OVERWRITE), words, "rig import-mano", ("file",)
+    )
+    model = read_mano(options.file, options.left_shape)
+    path = save_rig(model, options.out, extras["overwrite"])
+    facts = {"file": str(path), "side": model.side, "left_shape": model.left_shape}
+    facts |= _facts(model.rig) | {"licence": LICENCE}
+    if extras["json"]:
+        print_json(facts)
+        return 0
+    print_figures(facts)
+    reference = model.rig.name if options.out is None else path
+    print(f"\nnext: handavatar capture video FILE --out D --rig {reference}")
+    return 0
+
+
+def _facts(rig: "Rig") -> dict[str, Any]:
+    from handavatar.hand.detail import subdivided
+
     fine = subdivided(rig)
     extent = rig.template_vertices.amax(0) - rig.template_vertices.amin(0)
-    facts = {
+    return {
         "name": rig.name,
         "vertices": rig.num_vertices,
         "faces": len(rig.faces),
         "bones": rig.skin_weights.shape[1],
         "shape_directions": rig.shape_directions.shape[-1],
+        "pose_directions": rig.pose_directions.shape[-1],
         "size_metres": [round(value, 4) for value in extent.tolist()],
         "vertex_sets": {name: len(members) for name, members in rig.vertex_sets.items()},
         "high_resolution": {"vertices": fine.num_vertices, "faces": len(fine.faces)},
         "sha256": rig.sha256,
     }
-    (print_json if extras["json"] else print_figures)(facts)
-    return 0

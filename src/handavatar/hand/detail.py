@@ -9,7 +9,7 @@ from handavatar.hand.rig import Rig
 
 
 def subdivided(rig: Rig, rounds: int = 2) -> Rig:
-    """A finer rig: template, weights, shape directions and UV at edge midpoints.
+    """A finer rig: template, weights, blend shapes and UV at edge midpoints.
 
     Old vertices keep their indices; the joint regressor gets zero columns for the new ones, so
     joints stay where they were.
@@ -37,6 +37,7 @@ def _subdivided_once(rig: Rig) -> Rig:
         skin_weights=mesh.carried(rig.skin_weights),
         joint_regressor=torch.cat([rig.joint_regressor, padding], dim=1),
         shape_directions=mesh.carried(rig.shape_directions),
+        pose_directions=mesh.carried(rig.pose_directions),
         uv_coordinates=texture.carried(rig.uv_coordinates),
         uv_faces=texture.faces,
         vertex_sets={name: _carried_set(mesh, s, rig) for name, s in rig.vertex_sets.items()},

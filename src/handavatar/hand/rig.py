@@ -15,11 +15,18 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.geometry.meshes import boundary_loop
+from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import NUM_BONES, HandPose, bone_transforms, linear_blend_skinning
+
+_NUM_POSE_FEATURES = 9 * (NUM_BONES - 1)
 
 
 class RigError(ValueError):
     """A rig that cannot be used: what was found, what was expected, what to do."""
+
+
+class LicensedRigMissing(RigError):
+    """A rig that may not ship and is not here: which, and where to get it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +45,10 @@ class Rig:
         uv_faces: for each face corner, its texture coordinate.
         joint_axes: per bone the unit flexion, abduction and twist axes in rest axes.
         vertex_sets: named vertices, such as ``fingertips`` or ``nail_thumb``.
+        pose_directions: displacement in metres per unit of each entry of the finger bones'
+            rotation matrices minus identity, nine per bone, row by row; no columns if the rig has
+            no pose blend shapes.
+        is_licensed: its arrays may not be given on: files name it by its fingerprint alone.
     """
 
     name: str
@@ -50,16 +61,35 @@ class Rig:
     uv_faces: Int[Tensor, "faces 3"]
     joint_axes: Float[Tensor, "bones 3 3"]
     vertex_sets: dict[str, Int[Tensor, "_"]] = field(default_factory=dict)
+    pose_directions: Float[Tensor, "vertices 3 poses"] = field(
+        default_factory=lambda: torch.zeros(0, 3, 0)
+    )
+    is_licensed: bool = False
 
     def __post_init__(self) -> None:
         """Refuses arrays that contradict each other."""
         num_vertices = len(self.template_vertices)
+        if self.pose_directions.numel() == 0:
+            none = self.template_vertices.new_zeros(num_vertices, 3, 0)
+            object.__setattr__(self, "pose_directions", none)
+        elif self.pose_directions.shape != (num_vertices, 3, _NUM_POSE_FEATURES):
+            raise RigError(
+                f"rig {self.name}: pose_directions have shape "
+                f"{tuple(self.pose_directions.shape)}, expected "
+                f"({num_vertices}, 3, {_NUM_POSE_FEATURES})"
+            )
         if self.skin_weights.shape != (num_vertices, NUM_BONES):
             raise RigError(
                 f"rig {self.name}: skin_weights have shape {tuple(self.skin_weights.shape)}, "
                 f"expected ({num_vertices}, {NUM_BONES})"
             )
-        for label in ("template_vertices", "skin_weights", "joint_regressor", "shape_directions"):
+        for label in (
+            "template_vertices",
+            "skin_weights",
+            "joint_regressor",
+            "shape_directions",
+            "pose_directions",
+        ):
             if not bool(torch.isfinite(getattr(self, label)).all()):
                 raise RigError(f"rig {self.name}: {label} holds NaN or infinity")
         if int(self.faces.min()) < 0 or int(self.faces.max()) >= num_vertices:
@@ -67,7 +97,8 @@ class Rig:
                 f"rig {self.name}: faces name vertices {int(self.faces.min())} to "
                 f"{int(self.faces.max())}, but there are {num_vertices}"
             )
-        if not torch.allclose(self.skin_weights.sum(-1), torch.ones(()), atol=1e-4):
+        sums = self.skin_weights.sum(-1)
+        if not torch.allclose(sums, torch.ones_like(sums), atol=1e-4):
             raise RigError(f"rig {self.name}: rows of skin_weights do not sum to 1")
 
     @property
@@ -97,7 +128,11 @@ class Rig:
     def sha256(self) -> str:
         """Fingerprint of the arrays that decide where a posed vertex lies."""
         digest = sha256()
-        for value in (self.template_vertices, self.faces, self.skin_weights, self.joint_regressor):
+        deciding = [self.template_vertices, self.faces, self.skin_weights, self.joint_regressor]
+        if self.pose_directions.numel():
+            # MANO's left hand exists with two signs of its shape directions: they count too.
+            deciding += [self.pose_directions, self.shape_directions]
+        for value in deciding:
             digest.update(value.detach().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()
 
@@ -114,7 +149,7 @@ class Rig:
     def shaped(self, coefficients: Float[Tensor, "*batch shapes"] | None = None) -> "ShapedHand":
         """The rest hand of given shape coefficients (units: standard deviations).
 
-        Source: paper appendix A, the shape equation (no pose blend shapes in the open hand).
+        Source: paper appendix A, the shape equation. What the pose adds, adds ``ShapedHand.posed``.
         """
         vertices = self.template_vertices
         if coefficients is not None:
@@ -122,6 +157,24 @@ class Rig:
                 "vcs,...s->...vc", self.shape_directions, coefficients
             )
         return ShapedHand(self, vertices, self.joint_regressor @ vertices)
+
+    def pose_offsets(
+        self, rotations: Float[Tensor, "*batch bones 3"]
+    ) -> Float[Tensor, "*batch vertices 3"]:
+        """What a pose adds to the rest vertices before skinning (pose blend shapes), metres.
+
+        Zero in the zero pose, and in every pose of a rig without ``pose_directions``.
+
+        Args:
+            rotations: axis-angle, radians, relative to the parent; the wrist's does not matter.
+
+        Source: paper appendix A, B_p in the shape equation; as in MANO.
+        """
+        if self.pose_directions.numel() == 0:
+            return self.template_vertices.new_zeros(*rotations.shape[:-2], self.num_vertices, 3)
+        matrices = matrix_from_axis_angle(rotations[..., 1:, :])
+        features = (matrices - torch.eye(3).to(matrices)).flatten(-3)
+        return (features @ self.pose_directions.flatten(0, 1).T).unflatten(-1, (-1, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,7 +192,7 @@ class ShapedHand:
     rest_joints: Float[Tensor, "*batch bones 3"]
 
     def posed(self, pose: HandPose) -> "PosedHand":
-        """Linear blend skinning into the world."""
+        """Pose blend shapes, then linear blend skinning into the world."""
         world_from_bone = bone_transforms(pose.rotations, self.rest_joints)
         world_from_bone = torch.cat(
             [
@@ -156,6 +209,8 @@ class ShapedHand:
         )
         batch = pose.rotations.shape[:-2]
         rest = self.rest_vertices.expand(*batch, -1, -1)
+        if self.rig.pose_directions.numel():
+            rest = rest + self.rig.pose_offsets(pose.rotations)
         joints = self.rest_joints.expand(*batch, -1, -1)
         vertices = linear_blend_skinning(rest, self.rig.skin_weights, world_from_bone, joints)
         return PosedHand(self.rig, pose, vertices, world_from_bone)

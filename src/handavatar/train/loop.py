@@ -21,8 +21,7 @@ from handavatar.evaluate.perceptual import PerceptualLoss, perceptual_loss
 from handavatar.field.shading import OrientedCues, PaperCues
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside
-from handavatar.hand.open_hand import load_open_hand
-from handavatar.hand.rig import RigError
+from handavatar.hand.rigs import find_rig
 from handavatar.train.appearance import SeenSamples, appearance_loss, find_seen_samples
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.losses import color_loss, occupancy_loss
@@ -194,7 +193,7 @@ def train(options: TrainOptions) -> Path:
 
     Raises:
         CaptureError: if the capture is damaged or has no training frames.
-        RigError: if the capture's poses belong to another rig.
+        RigError: if the rig that the capture's poses belong to is not here.
         CheckpointError: if the run to resume is damaged.
         FloatingPointError: if the loss is no longer finite; the last checkpoint stays.
         Interrupted: after SIGINT or SIGTERM; a checkpoint was saved.
@@ -253,13 +252,7 @@ def begin_training(
     capture: Capture, frames: list[Frame], method: Method, options: TrainOptions
 ) -> Training:
     """An untrained avatar of the capture's person with the prior's geometry, and its optimiser."""
-    rig = load_open_hand()
-    if capture.rig_sha256 != rig.sha256:
-        raise RigError(
-            f"{capture.folder}: its poses belong to rig {capture.rig_name} "
-            f"({capture.rig_sha256[:12]}), this is {rig.name} ({rig.sha256[:12]}): make the "
-            "capture again with this version"
-        )
+    rig = find_rig(capture.rig_sha256, capture.rig_name)
     torch.manual_seed(options.seed)
     info = {
         "side": capture.side,
