@@ -20,6 +20,8 @@ from handavatar.train.prior import load_prior
 
 TINY = Method(
     steps=12,
+    outline_rounds=1,
+    outline_visits=1,
     warm_steps=3,
     warm_pixels=64,
     warm_stride=2,

@@ -1,7 +1,8 @@
-"""A held-out frame's pose is pulled onto its mask, and only there."""
+"""A tracked pose is pulled onto its mask, and only there."""
 
 import inspect
 
+import pytest
 import torch
 from conftest import bent_pose, camera_above
 from torch import Tensor
@@ -11,52 +12,65 @@ from handavatar.avatar import HandAvatar
 from handavatar.hand.pose import HandPose
 from handavatar.render.rasterize import rasterize
 
+SIZE = 96
+
 
 @torch.no_grad()
 def _mask(avatar: HandAvatar, pose: HandPose) -> Tensor:
-    vertices = avatar.personal(pose).posed(pose).vertices
-    return rasterize(vertices, avatar.rig.faces, camera_above(64)).mask
+    posed = avatar.coarse_personal(pose).posed(pose)
+    return rasterize(posed.vertices, posed.rig.faces, camera_above(SIZE)).mask
 
 
 def _overlap(a: Tensor, b: Tensor) -> float:
     return int((a & b).sum()) / int((a | b).sum())
 
 
-def _aligned(avatar: HandAvatar, pose: HandPose, mask: Tensor, steps: int) -> HandPose:
-    return aligned_pose(avatar, pose, camera_above(64), mask, steps=steps, size=64)
+def _aligned(avatar: HandAvatar, pose: HandPose, mask: Tensor, steps: int = 8) -> HandPose:
+    return aligned_pose(avatar.coarse_personal, pose, camera_above(SIZE), mask, steps)
 
 
-def test_a_shifted_pose_is_pulled_back_onto_the_mask(small_avatar: HandAvatar) -> None:
+def test_a_moved_and_bent_pose_is_pulled_back_onto_the_mask(small_avatar: HandAvatar) -> None:
     true = bent_pose(1)
     mask = _mask(small_avatar, true)
-    shifted = HandPose(true.rotations, true.translation + torch.tensor([0.006, 0.0, -0.005]))
+    rotations = true.rotations.clone()
+    rotations[1, 1] += 0.06  # The index finger points aside: 5 mm at its tip.
+    moved = HandPose(rotations, true.translation + torch.tensor([0.003, 0.0, -0.003]))
     before = {name: value.clone() for name, value in small_avatar.state_dict().items()}
-    found = _aligned(small_avatar, shifted, mask, steps=15)
+    found = _aligned(small_avatar, moved, mask)
 
-    overlap = [_overlap(_mask(small_avatar, pose), mask) for pose in (shifted, found)]
-    assert overlap[1] > overlap[0] + 0.05
-    # Of the 8 mm at least half; a pixel is 4 mm wide.
-    assert float((found.translation - true.translation).norm()) < 0.004
+    overlap = [_overlap(_mask(small_avatar, pose), mask) for pose in (moved, found)]
+    # Pixels are 2.6 mm wide: the picture tells a third of one.
+    assert overlap[0] < 0.92 and overlap[1] > 0.965
+    error = (found.translation - true.translation)[[0, 2]].norm()
+    assert float(error) < 0.5 * 0.003 * 2**0.5
     for name, value in small_avatar.state_dict().items():
         assert torch.equal(value, before[name]), name
     assert all(parameter.grad is None for parameter in small_avatar.parameters())
     assert not found.rotations.requires_grad and not found.translation.requires_grad
 
 
-def test_it_never_ends_farther_from_the_mask_than_it_began(small_avatar: HandAvatar) -> None:
-    """The best trial is kept, and the first trial is the pose as it was."""
+@pytest.mark.parametrize("steps", [0, 3])
+def test_it_never_ends_farther_from_the_mask_than_it_began(
+    small_avatar: HandAvatar, steps: int
+) -> None:
     pose = bent_pose(1)
-    found = _aligned(small_avatar, pose, _mask(small_avatar, pose), steps=0)
-    assert torch.equal(found.rotations, pose.rotations)
-    assert torch.equal(found.translation, pose.translation)
+    mask = _mask(small_avatar, pose)
+    found = _aligned(small_avatar, pose, mask, steps)
+    assert _overlap(_mask(small_avatar, found), mask) >= 1.0
 
 
-def test_an_empty_mask_gives_a_finite_pose(small_avatar: HandAvatar) -> None:
-    found = _aligned(small_avatar, bent_pose(0), torch.zeros(64, 64, dtype=torch.bool), steps=2)
-    assert bool(torch.isfinite(found.rotations).all() & torch.isfinite(found.translation).all())
+def test_a_mask_far_away_or_empty_changes_little(small_avatar: HandAvatar) -> None:
+    pose = bent_pose(0)
+    empty = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    assert _aligned(small_avatar, pose, empty) is pose
+    corner = empty.clone()
+    corner[:6, :6] = True
+    found = _aligned(small_avatar, pose, corner)
+    assert float((found.rotations - pose.rotations).abs().max()) < 0.5
+    assert float((found.translation - pose.translation).norm()) < 0.05
 
 
 def test_it_is_given_no_colours() -> None:
     """What is not handed over cannot be used: mask and camera, but neither frame nor image."""
     names = list(inspect.signature(aligned_pose).parameters)
-    assert names == ["avatar", "pose", "camera", "mask", "steps", "size"]
+    assert names == ["hand_of", "pose", "camera", "mask", "steps", "start"]

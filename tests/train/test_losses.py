@@ -34,16 +34,18 @@ def test_offset_loss_agrees_with_a_loop_over_the_vertices() -> None:
     for vertex in range(5):
         ring = [int(b if a == vertex else a) for a, b in EDGES if vertex in (int(a), int(b))]
         rough = offsets[ring].mean(0) - offsets[vertex]
-        total += float(10 * rough.square().sum() + 0.01 * offsets[vertex].square().sum()) / 5
-    found = offset_loss(offsets, EDGES)
+        total += float(1.6e-3 * rough.square().sum() + 5e-5 * offsets[vertex].square().sum()) / 5
+    # Edges of 2.5 mm, half of the open hand's: sixteen times the weight.
+    found = offset_loss(offsets, EDGES, 0.0025)
     torch.testing.assert_close(found, torch.tensor(1e6 * total).double())
 
 
 def test_an_even_offset_is_cheap_and_a_rough_one_dear() -> None:
     even = torch.full((5, 3), 0.001)
     rough = even * torch.tensor([1.0, 1, 1, 1, -1])[:, None]
-    assert float(offset_loss(torch.zeros(5, 3), EDGES)) == 0
-    assert float(offset_loss(rough, EDGES)) > 100 * float(offset_loss(even, EDGES))
+    assert float(offset_loss(torch.zeros(5, 3), EDGES, 0.0025)) == 0
+    costs = [float(offset_loss(offsets, EDGES, 0.0025)) for offsets in (rough, even)]
+    assert costs[0] > 10 * costs[1]
 
 
 def test_gradients_agree_with_finite_differences() -> None:
@@ -53,4 +55,4 @@ def test_gradients_agree_with_finite_differences() -> None:
     is_inside, truth = _random(6) > 0.5, _random(5, 3)[:4].double() + 2
     assert torch.autograd.gradcheck(lambda p: occupancy_loss(p, is_inside), predicted)
     assert torch.autograd.gradcheck(lambda r: color_loss(r, truth), rendered)
-    assert torch.autograd.gradcheck(lambda o: offset_loss(o, EDGES), offsets)
+    assert torch.autograd.gradcheck(lambda o: offset_loss(o, EDGES, 0.0025), offsets)

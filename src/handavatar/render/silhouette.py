@@ -76,17 +76,40 @@ def soft_silhouette(
 
 
 def silhouette_loss(
-    coverage: Float[Tensor, "*pixels"], mask: Bool[Tensor, "*pixels"]
+    coverage: Float[Tensor, "*pixels"], mask: Float[Tensor, "*pixels"]
 ) -> Float[Tensor, ""]:
     """One minus the soft intersection over union; 0 if both are empty.
 
     To leave pixels out, such as those below the wrist, index both arguments alike.
 
+    Args:
+        coverage: of the mesh, in [0, 1].
+        mask: of the picture, in [0, 1]; see :func:`soft_mask`.
+
     Source: paper Sec. 3.1, L_shape.
+    Departs: minimum and maximum instead of product and sum less product. For a mask of zeros and
+        ones both are the same; but against one a soft outline is best outside of it: by 0.35 pixels
+        in a picture of 192 pixels, by 0.65 in one of 64. Against a soft mask it is best on it.
     """
-    intersection = coverage[mask].sum()
-    union = coverage.sum() + mask.sum() - intersection
-    return 1 - intersection / union if bool(union > 0) else union
+    union = torch.maximum(coverage, mask).sum()
+    return 1 - torch.minimum(coverage, mask).sum() / union if bool(union > 0) else union
+
+
+def soft_mask(
+    mask: Bool[Tensor, "height width"], size: int, softness: float = 1.0
+) -> Float[Tensor, "size size"]:
+    """A mask with ``size`` pixels along a side, as :func:`soft_silhouette` would cover it.
+
+    Args:
+        mask: true on the hand.
+        size: pixels along a side of the result.
+        softness: pixels of the result.
+    """
+    distance = interpolate(
+        signed_distance(mask)[None, None], (size, size), mode="bilinear", antialias=True
+    )[0, 0]
+    distance = distance * (size / mask.shape[-1])
+    return torch.sigmoid(-distance * distance.abs() / softness**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,12 +222,6 @@ def _outline(
     sides = torch.cat([middle + across, middle - across])
     is_covered = _is_covered(sides, pixels.double()[faces], math.ceil(radius) + 1, width, height)
     return pieces.chosen(~is_covered.reshape(2, -1).all(0))
-
-
-def resized_mask(mask: Bool[Tensor, "height width"], size: int) -> Bool[Tensor, "size size"]:
-    """A mask with ``size`` pixels along a side: true where more than half of the pixel was."""
-    shares = interpolate(mask[None, None].float(), (size, size), mode="area")
-    return shares[0, 0] > 0.5
 
 
 def _contour_edges(

@@ -17,7 +17,7 @@ from handavatar.field.shape import personal_hand
 from handavatar.geometry.meshes import unique_edges
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, Rig
-from handavatar.render.silhouette import resized_mask, silhouette_loss, soft_silhouette
+from handavatar.render.silhouette import silhouette_loss, soft_mask, soft_silhouette
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.losses import offset_loss
 from handavatar.train.progress import Progress
@@ -67,7 +67,7 @@ def shape_losses(
     camera = frame.camera.to(device).resized(size, size)
     coverage = soft_silhouette(posed.vertices, posed.rig.faces, camera)
     return {
-        "silhouette": silhouette_loss(coverage, resized_mask(frame.mask, size).to(device)),
+        "silhouette": silhouette_loss(coverage, soft_mask(frame.mask, size).to(device)),
         "offsets": offset_loss(offsets, edges.edges, edges.spacing),
     }
 
