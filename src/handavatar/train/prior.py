@@ -55,7 +55,9 @@ class PriorOptions:
         rounds: midpoint subdivisions of the mesh that is encoded and labelled.
         seed: of everything.
         start: a prior to continue from.
-        decoder: ``pair`` is the avatar's; the others only serve for comparison with it.
+        decoder: ``pair`` is PairOF, the avatar's. Only for comparison with it: ``pair-shuffled``
+            pairs parts that do not touch, ``coap`` and ``coap-wide`` decode each part alone,
+            ``transformer`` all parts together.
         device: where the networks run.
     """
 
