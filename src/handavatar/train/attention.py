@@ -13,7 +13,7 @@ from handavatar.field.partwise import PartwiseOccupancy
 from handavatar.field.transformer import TransformerDecoder, attention_maps
 from handavatar.hand.pose import BONE_NAMES, CONNECTED_PAIRS, NUM_BONES
 
-_CELL, _LABELS, _TITLE, _GAP = 15, 46, 18, 10
+_CELL, _LABELS, _TITLE, _GAP = 15, 60, 18, 10
 """Pixels: of a cell, of the names left of a map, of the line above it, between maps."""
 _DARKEST = 0.5
 """The weight that the picture paints darkest."""
@@ -120,14 +120,14 @@ def attention_picture(readings: Mapping[str, AttentionReading]) -> Image.Image:
         maps = [reading.rows.mean(0), *reading.rows]
         for column, weights in enumerate(maps):
             left, top = _LABELS + column * (side + _GAP), line * line_height + _TITLE
-            title = f"{name}: mean of all blocks" if column == 0 else f"block {column}"
+            title = f"{name}, mean of all blocks" if column == 0 else f"block {column}"
             draw.text((left, top - _TITLE + 3), title, "black")
             _draw_map(draw, left, top, weights, reading.counts)
             for bone in range(NUM_BONES):
                 draw.text((left + bone * _CELL + 1, top + side + 1), str(bone), "black")
         for bone, part in enumerate(BONE_NAMES):
             place = (1, line * line_height + _TITLE + bone * _CELL + 1)
-            draw.text(place, part, "black", font_size=9)
+            draw.text(place, f"{bone:>2} {part}", "black", font_size=9)
     return picture
 
 
