@@ -46,7 +46,7 @@ AT_LEAST = {
     "capture.video": "VideoOptions capture_video",
     "capture.synthetic": "SynthOptions make_capture",
     "train.loop": "TrainOptions train",
-    "train.prior": "PriorOptions train_prior PriorEvaluationOptions evaluate_prior",
+    "train.prior": "PriorOptions train_prior PriorEvaluationOptions evaluate_prior open_prior",
     "evaluate.run": "EvaluateOptions evaluate_run",
     "doctor": "Finding examine",
     "cli": "main",

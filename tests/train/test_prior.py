@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from handavatar.avatar import CheckpointError
+from handavatar.field.decoders import Decoder, untrained_field
 from handavatar.field.occupancy import PairOccupancy
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.open_hand import load_open_hand
@@ -22,6 +24,7 @@ from handavatar.train.prior import (
     intersection_over_union,
     labelled_pose,
     load_prior,
+    open_prior,
     train_prior,
 )
 
@@ -94,6 +97,30 @@ def test_broken_priors_are_refused(tmp_path: Path) -> None:
     for name in ("cut", "noise", "other"):
         with pytest.raises(CheckpointError, match=f"{name} is not a usable occupancy prior"):
             load_prior(PairOccupancy(), tmp_path / name)
+
+
+@pytest.mark.parametrize("decoder", get_args(Decoder))
+def test_a_file_knows_its_decoder(tmp_path: Path, decoder: Decoder) -> None:
+    options = replace(_options(tmp_path / "a"), steps=2, points=64, decoder=decoder)
+    trained = train_prior(options).state_dict()
+    opened = open_prior(options.out)
+    assert type(opened) is type(untrained_field(decoder))
+    assert all(torch.equal(value, trained[name]) for name, value in opened.state_dict().items())
+    for other in get_args(Decoder):
+        if other != decoder:
+            # Shuffled and real pairs have weights of the same shapes, so shapes are no guard.
+            with pytest.raises(CheckpointError, match=rf"'{decoder}', expected '{other}'"):
+                load_prior(untrained_field(other), options.out, other)
+    scores = evaluate_prior(
+        PriorEvaluationOptions(options.out, poses=1, points=64, level="778", rounds=0)
+    )
+    assert 0 <= scores["iou"] <= 1
+
+
+def test_a_prior_with_an_unknown_decoder_is_refused(tmp_path: Path) -> None:
+    save_file({"a": torch.zeros(1)}, tmp_path / "new", {"decoder": "diffusion"})
+    with pytest.raises(CheckpointError, match="found the decoder 'diffusion'"):
+        open_prior(tmp_path / "new")
 
 
 def test_the_shipped_prior_knows_poses_it_never_saw() -> None:

@@ -27,6 +27,8 @@ LENGTH_SCALE = 20.0
 """Bone-frame metres are multiplied by this before any network sees them (5 cm become 1)."""
 LOGIT_SCALE = 10.0
 """The decoder's output is multiplied by this: a surface needs logits of some units per mm."""
+BOX_MARGIN = 0.012
+"""How far a part's box reaches beyond the part, metres."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,8 +205,9 @@ class PairOccupancy(nn.Module):
         self,
         fusion: MaximumFusion | SoftmaxFusion | None = None,
         softness: float = 0.05,
-        margin: float = 0.012,
+        margin: float = BOX_MARGIN,
         chunk: int = 1024,
+        connections: tuple[tuple[int, int], ...] = CONNECTED_PAIRS,
     ) -> None:
         """Builds an untrained field.
 
@@ -213,6 +216,8 @@ class PairOccupancy(nn.Module):
             softness: the paper's tau.
             margin: how far a part's box reaches beyond the part, metres.
             chunk: points evaluated at a time without gradient.
+            connections: the pairs of parts to decode, every part in one at least; others than
+                the physical ones serve as a control.
 
         Departs: the authors' boxes are twice the size of the part. A fixed margin gives fingers
             the same reach, and spares the wide empty space that doubling the palm encloses.
@@ -224,13 +229,12 @@ class PairOccupancy(nn.Module):
         self.softness = softness
         self.margin = margin
         self.chunk = chunk
-        self.register_buffer("pairs", torch.tensor(CONNECTED_PAIRS), persistent=False)
+        self.connections = connections
+        self.register_buffer("pairs", torch.tensor(connections), persistent=False)
 
     def encode(self, parts: Parts, posed: PosedHand) -> HandCodes:
         """Encodes the surface of a posed hand; once per pose."""
-        clouds = parts.point_clouds(posed)
-        scaled = torch.cat([clouds[..., :3] * LENGTH_SCALE, clouds[..., 3:]], dim=-1)
-        return HandCodes(self.encoder(scaled), parts.boxes(posed, self.margin))
+        return hand_codes(self.encoder, parts, posed, self.margin)
 
     def forward(self, codes: HandCodes, points: Float[Tensor, "points 3"]) -> Occupancy:
         """Occupancy at world points (metres), without gradient; the fast way."""
@@ -247,6 +251,14 @@ class PairOccupancy(nn.Module):
         return Occupancy(
             torch.cat([p.whole for p in pieces]), torch.cat([p.soft_parts for p in pieces]), items
         )
+
+    def trainable_whole(
+        self, codes: HandCodes, points: Float[Tensor, "points 3"]
+    ) -> Float[Tensor, "points"]:
+        """Occupancy of the hand with gradient: first which pairs decide, then those alone."""
+        with torch.no_grad():
+            items = self(codes, points).items
+        return self.of_items(codes, points, items)
 
     def of_items(
         self, codes: HandCodes, points: Float[Tensor, "points 3"], items: PairItems
@@ -309,7 +321,7 @@ class PairOccupancy(nn.Module):
         is_active = is_in_box[:, first] | is_in_box[:, second]
         pair_index, point_index = is_active.T.nonzero().unbind(-1)
         is_needed = torch.zeros_like(is_in_box)
-        for column, (a, b) in enumerate(CONNECTED_PAIRS):
+        for column, (a, b) in enumerate(self.connections):
             is_needed[:, a] |= is_active[:, column]
             is_needed[:, b] |= is_active[:, column]
         features, row_of = self._part_features(codes, local, is_needed)
@@ -362,6 +374,22 @@ class PairOccupancy(nn.Module):
             torch.addmm(biases[bone], inside, position_weight, out=features[start : start + count])
             start += count
         return self.decoder.pointnet.blocks[0](features), row_of
+
+
+def hand_codes(encoder: PointNet, parts: Parts, posed: PosedHand, margin: float) -> HandCodes:
+    """Encodes the surface of every part of a posed hand, and bounds it by a box.
+
+    Args:
+        encoder: of clouds of 256 points with normals; lengths times ``LENGTH_SCALE``.
+        parts: which points.
+        posed: the hand.
+        margin: how far a part's box reaches beyond the part, metres.
+
+    Source: paper Sec. 3.2, part-space encoder.
+    """
+    clouds = parts.point_clouds(posed)
+    scaled = torch.cat([clouds[..., :3] * LENGTH_SCALE, clouds[..., 3:]], dim=-1)
+    return HandCodes(encoder(scaled), parts.boxes(posed, margin))
 
 
 def local_points(

@@ -16,7 +16,7 @@ from handavatar.geometry.meshes import (
     sample_surface_evenly,
 )
 from handavatar.geometry.rotations import apply_rigid, invert_rigid
-from handavatar.hand.pose import BONE_PARENTS, NUM_BONES
+from handavatar.hand.pose import BONE_PARENTS, CONNECTED_PAIRS, NUM_BONES
 from handavatar.hand.rig import PosedHand, Rig, RigError
 
 EXTENSION = 0.010
@@ -143,3 +143,18 @@ def divide_into_parts(rig: Rig, points_per_part: int = 256, seed: int = 0) -> Pa
         corner_indices.append(torch.cat([cloud.faces for cloud in clouds]))
         barycentric.append(torch.cat([cloud.barycentric for cloud in clouds]))
     return Parts(labels, torch.stack(corner_indices), torch.stack(barycentric))
+
+
+def shuffled_pairs(seed: int) -> tuple[tuple[int, int], ...]:
+    """A tree of pairs like ``CONNECTED_PAIRS`` whose parts have changed places at random.
+
+    Every part is in a pair, and none of the pairs is physically connected: a control for the
+    claim that connections matter.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    real = {frozenset(pair) for pair in CONNECTED_PAIRS}
+    while True:
+        place = torch.randperm(NUM_BONES, generator=generator).tolist()
+        pairs = tuple((place[a], place[b]) for a, b in CONNECTED_PAIRS)
+        if real.isdisjoint(frozenset(pair) for pair in pairs):
+            return pairs

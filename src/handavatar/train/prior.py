@@ -10,14 +10,16 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import get_args
 
 import torch
 from jaxtyping import Bool, Float
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from handavatar.avatar import CheckpointError
-from handavatar.field.occupancy import PairOccupancy
+from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
 from handavatar.geometry.meshes import is_inside, sample_surface
 from handavatar.geometry.rotations import apply_rigid
 from handavatar.hand.detail import subdivided
@@ -53,6 +55,9 @@ class PriorOptions:
         rounds: midpoint subdivisions of the mesh that is encoded and labelled.
         seed: of everything.
         start: a prior to continue from.
+        decoder: ``pair`` is PairOF, the avatar's. Only for comparison with it: ``pair-shuffled``
+            pairs parts that do not touch, ``coap`` and ``coap-wide`` decode each part alone,
+            ``transformer`` all parts together.
         device: where the networks run.
     """
 
@@ -69,6 +74,7 @@ class PriorOptions:
     rounds: int = 1
     seed: int = 0
     start: Path | None = None
+    decoder: Decoder = "pair"
     device: str = "cpu"
 
 
@@ -122,7 +128,7 @@ def labelled_pose(
 
 def train_prior(
     options: PriorOptions, report: Callable[[int, dict[str, float]], None] | None = None
-) -> PairOccupancy:
+) -> OccupancyField:
     """Pre-trains the occupancy field and writes it.
 
     Args:
@@ -137,9 +143,9 @@ def train_prior(
     rig = subdivided(base, options.rounds)
     parts = divide_into_parts(rig)
     torch.manual_seed(options.seed)
-    field = PairOccupancy()
+    field = untrained_field(options.decoder)
     if options.start is not None:
-        load_prior(field, options.start)
+        load_prior(field, options.start, options.decoder)
     field.to(options.device)
     parts_there = parts.to(options.device)
     generator = torch.Generator().manual_seed(options.seed)
@@ -163,9 +169,7 @@ def train_prior(
             points = sample.points[chosen].to(options.device)
             target = sample.is_inside[chosen].to(points)
             codes = field.encode(parts_there, _moved(sample.posed, options.device))
-            with torch.no_grad():
-                items = field(codes, points).items
-            predicted = field.of_items(codes, points, items)
+            predicted = field.trainable_whole(codes, points)
             if step <= options.warm_up * options.steps:
                 term = torch.nn.functional.binary_cross_entropy(predicted, target)
             else:
@@ -193,7 +197,7 @@ def _moved(posed: PosedHand, device: str) -> PosedHand:
     )
 
 
-def save_prior(field: PairOccupancy, options: PriorOptions, step: int) -> None:
+def save_prior(field: OccupancyField, options: PriorOptions, step: int) -> None:
     """Writes the weights aside and renames them into place."""
     rig = load_open_hand(options.level)
     record = {**asdict(options), "out": options.out.name, "start": str(options.start)}
@@ -201,6 +205,7 @@ def save_prior(field: PairOccupancy, options: PriorOptions, step: int) -> None:
         "schema": "1",
         "rig": rig.name,
         "rig_sha256": rig.sha256,
+        "decoder": options.decoder,
         "margin": str(field.margin),
         "step": str(step),
         "options": json.dumps(record),
@@ -212,20 +217,61 @@ def save_prior(field: PairOccupancy, options: PriorOptions, step: int) -> None:
     aside.replace(options.out)
 
 
-def load_prior(field: PairOccupancy, path: Path = SHIPPED_PRIOR) -> None:
+def load_prior(
+    field: OccupancyField, path: Path = SHIPPED_PRIOR, decoder: Decoder = "pair"
+) -> None:
     """Loads pre-trained weights into a field.
 
+    Args:
+        field: with the given decoder.
+        path: a file that :func:`train_prior` wrote.
+        decoder: which one the weights must be of; shapes alone do not tell.
+
     Raises:
-        CheckpointError: if the file is missing, damaged or of another structure.
+        CheckpointError: if the file is missing, damaged or of another decoder.
     """
-    if not path.is_file():
+    found = _decoder_of(path)
+    if found != decoder:
         raise CheckpointError(
-            f"no occupancy prior at {path}: train one with `handavatar prior train --out {path}`"
+            f"{path} holds a prior with the decoder {found!r}, expected {decoder!r}: train one "
+            f"with `handavatar prior train --decoder {decoder}`"
         )
     try:
         field.load_state_dict(load_file(path))
     except Exception as error:
         raise CheckpointError(f"{path} is not a usable occupancy prior: {error}") from error
+
+
+def open_prior(path: Path = SHIPPED_PRIOR) -> OccupancyField:
+    """The pre-trained field of a file, with the decoder that the file names.
+
+    Raises:
+        CheckpointError: if the file is missing, damaged or of an unknown decoder.
+    """
+    decoder = _decoder_of(path)
+    field = untrained_field(decoder)
+    load_prior(field, path, decoder)
+    return field
+
+
+def _decoder_of(path: Path) -> Decoder:
+    """Which decoder a file's weights are of; the first files did not say and hold PairOF."""
+    if not path.is_file():
+        raise CheckpointError(
+            f"no occupancy prior at {path}: train one with `handavatar prior train --out {path}`"
+        )
+    try:
+        with safe_open(path, framework="pt") as file:
+            found = (file.metadata() or {}).get("decoder", "pair")
+    except Exception as error:
+        raise CheckpointError(f"{path} is not a usable occupancy prior: {error}") from error
+    for decoder in get_args(Decoder):
+        if decoder == found:
+            return decoder
+    raise CheckpointError(
+        f"{path} is not a usable occupancy prior: found the decoder {found!r}, expected one of "
+        f"{get_args(Decoder)}; it may come from a newer version"
+    )
 
 
 @dataclass(frozen=True)
@@ -253,27 +299,48 @@ def evaluate_prior(options: PriorEvaluationOptions) -> dict[str, float]:
     Returns:
         ``iou`` (mean over poses of the mean of the next two), ``iou_boxes``, ``iou_surface``.
     """
+    field = open_prior(options.prior)
+    parts, samples = evaluation_poses(options, field.margin)
+    scores = pose_scores(field, parts, samples)
+    boxes, surface = scores.mean(0).tolist()
+    return {"iou": (boxes + surface) / 2, "iou_boxes": boxes, "iou_surface": surface}
+
+
+def evaluation_poses(
+    options: PriorEvaluationOptions, margin: float
+) -> tuple[Parts, list[LabelledPose]]:
+    """Unseen poses of unseen shapes with labelled points, the same at every call.
+
+    Args:
+        options: how many; ``prior`` plays no part.
+        margin: of the part boxes, metres.
+    """
     base = load_open_hand(options.level)
     rig = subdivided(base, options.rounds)
     parts = divide_into_parts(rig)
-    field = PairOccupancy()
-    load_prior(field, options.prior)
     generator = torch.Generator().manual_seed(EVALUATION_SEED)
     rotations = resolve_penetration(base, sample_poses(base, options.poses, generator))
+    return parts, [
+        labelled_pose(rig, parts, pose, options.points, margin, generator) for pose in rotations
+    ]
+
+
+def pose_scores(
+    field: OccupancyField, parts: Parts, samples: list[LabelledPose]
+) -> Float[Tensor, "poses 2"]:
+    """Intersection over union of each pose: in the part boxes, and near the surface."""
     scores = []
-    for pose in rotations:
-        sample = labelled_pose(rig, parts, pose, options.points, field.margin, generator)
+    for sample in samples:
         with torch.no_grad():
             predicted = field(field.encode(parts, sample.posed), sample.points).whole > 0.5
-        half = options.points // 2
+        half = len(sample.points) // 2
         scores.append(
             [
                 intersection_over_union(predicted[window], sample.is_inside[window])
                 for window in (slice(0, half), slice(half, None))
             ]
         )
-    boxes, surface = torch.tensor(scores).mean(0).tolist()
-    return {"iou": (boxes + surface) / 2, "iou_boxes": boxes, "iou_surface": surface}
+    return torch.tensor(scores)
 
 
 def intersection_over_union(

@@ -1,0 +1,142 @@
+"""The geometry table: alike for all decoders, paired, and honest about what it does not know."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+import torch
+
+from handavatar.field.decoders import Decoder, OccupancyField
+from handavatar.field.occupancy import HandCodes
+from handavatar.hand.rig import PosedHand
+from handavatar.train.comparison import ComparisonOptions, compare_decoders, comparison_table
+from handavatar.train.prior import PriorEvaluationOptions, evaluate_prior
+
+
+def _options(out: Path) -> ComparisonOptions:
+    return ComparisonOptions(
+        out,
+        steps=1,
+        points=64,
+        pool=1,
+        poses=3,
+        judged_points=256,
+        measured_poses=2,
+        level="778",
+        rounds=0,
+    )
+
+
+def _volume(field: OccupancyField, codes: HandCodes, posed: PosedHand) -> Mapping[str, float]:
+    """Stands for a measure of the extracted mesh."""
+    whole = field(codes, posed.vertices).whole
+    return {"covered": float((whole > 0).float().mean()), "mean": float(whole.mean())}
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
+    out = tmp_path_factory.mktemp("compared") / "decoders"
+    options = replace(
+        _options(out), seeds=(0, 1), decoders=("pair-shuffled", "pair", "transformer")
+    )
+    return out, compare_decoders(options, (_volume,))
+
+
+def test_the_result_is_json_and_names_what_was_compared(
+    compared: tuple[Path, dict[str, Any]],
+) -> None:
+    out, value = compared
+    assert json.loads(json.dumps(value, allow_nan=False)) is not None
+    rows = value["decoders"]
+    assert [rows[name]["parameters"] for name in rows] == [232_513, 232_513, 255_977]
+    for row in rows.values():
+        assert row["iou"] == pytest.approx((row["iou_boxes"] + row["iou_surface"]) / 2)
+        share = row["iou"] * 100 / (row["parameters"] / 1e5)
+        assert row["iou_points_per_100k"] == pytest.approx(share)
+        assert 0 < row["covered"] <= 1 and row["training_seconds"] > 0
+    assert "minus_pair" not in rows["pair"]
+    assert isinstance(value["control_hurts"], bool)
+    assert {path.name for path in out.iterdir()} == {
+        "attention.png",
+        *(f"{name}-{seed}.safetensors" for name in rows for seed in (0, 1)),
+    }
+    for gesture in ("flat", "fist"):
+        assert value["attention"][gesture]["preference"] > 0
+
+
+def test_differences_are_paired_and_over_seeds_too(compared: tuple[Path, dict[str, Any]]) -> None:
+    _, value = compared
+    for name in ("pair-shuffled", "transformer"):
+        row = value["decoders"][name]
+        for column in ("iou", "iou_boxes", "iou_surface", "covered", "mean"):
+            expected = row[column] - value["decoders"]["pair"][column]
+            for kind in ("minus_pair", "minus_pair_over_seeds"):
+                found = row[kind][column]
+                assert found["mean"] == pytest.approx(expected, abs=1e-6)
+                assert found["low"] <= found["mean"] <= found["high"]
+
+
+def test_the_judging_poses_are_those_of_prior_evaluate(
+    compared: tuple[Path, dict[str, Any]],
+) -> None:
+    out, value = compared
+    scores = [
+        evaluate_prior(
+            PriorEvaluationOptions(
+                out / f"transformer-{seed}.safetensors", 3, 256, level="778", rounds=0
+            )
+        )["iou"]
+        for seed in (0, 1)
+    ]
+    assert value["decoders"]["transformer"]["iou"] == pytest.approx(sum(scores) / 2, abs=1e-6)
+
+
+def test_the_table_has_a_line_for_each_decoder(compared: tuple[Path, dict[str, Any]]) -> None:
+    _, value = compared
+    lines = comparison_table(value).splitlines()
+    assert len(lines) == 2 + 3
+    assert len({line.count("|") for line in lines}) == 1
+    assert "covered" in lines[0] and "232,513" in lines[2] and "| - |" in lines[3]
+
+
+def test_every_decoder_sees_the_same_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What reaches the inside test, training by training."""
+    import handavatar.train.prior as prior
+
+    seen: list[list[torch.Tensor]] = []
+    original = prior.sample_points
+
+    def watched(*arguments: Any) -> torch.Tensor:
+        seen[-1].append(original(*arguments))
+        return seen[-1][-1]
+
+    monkeypatch.setattr(prior, "sample_points", watched)
+    for decoder in get_args(Decoder):
+        seen.append([])
+        options = prior.PriorOptions(
+            tmp_path / decoder, steps=1, points=32, pool=1, level="778", rounds=0, decoder=decoder
+        )
+        prior.train_prior(options)
+    for points in seen[1:]:
+        assert len(points) == len(seen[0]) > 0
+        assert all(torch.equal(a, b) for a, b in zip(points, seen[0], strict=True))
+
+
+def test_impossible_comparisons_are_refused(tmp_path: Path) -> None:
+    options = _options(tmp_path / "none")
+    for wrong, message in (
+        (replace(options, decoders=("coap", "transformer")), "expected 'pair'"),
+        (replace(options, decoders=("pair",)), "at least one other"),
+        (replace(options, seeds=(1, 1)), "expected different ones"),
+        (replace(options, seeds=()), "expected different ones"),
+        (replace(options, poses=1, measured_poses=1), "two or more"),
+        (replace(options, measured_poses=4), "no more measured than judged"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            compare_decoders(wrong)
+    assert not (tmp_path / "none").exists()
