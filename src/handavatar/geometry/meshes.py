@@ -1,7 +1,7 @@
 """Triangle meshes: normals, subdivision, surface sampling, inside test, distances, Laplacian.
 
-Lengths in metres, faces wound counter-clockwise seen from outside. Inside tests and closest
-points run in libigl on the CPU; everything else is torch on the tensors' own device.
+Lengths in metres, faces wound counter-clockwise seen from outside. Inside tests (libigl) and
+distances run on the CPU; everything else is torch on the tensors' own device.
 """
 
 from dataclasses import dataclass
@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
+
+from handavatar.geometry.closest import closest_on_mesh
 
 
 def face_cross_products(
@@ -215,12 +217,7 @@ def distance_to_mesh(
     points: Float[Tensor, "points 3"],
 ) -> Float[Tensor, "points"]:
     """Unsquared distance in metres to the nearest point of the surface, without gradient."""
-    squared, _, _ = igl.point_mesh_squared_distance(
-        np.ascontiguousarray(points.detach().cpu().double().numpy()),
-        np.ascontiguousarray(vertices.detach().cpu().double().numpy()),
-        np.ascontiguousarray(faces.cpu().numpy().astype(np.int64)),
-    )
-    return torch.from_numpy(np.sqrt(np.maximum(squared, 0))).to(points)
+    return closest_on_mesh(vertices, faces, points).distances
 
 
 def uniform_laplacian(
