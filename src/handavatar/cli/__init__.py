@@ -24,6 +24,7 @@ COMMANDS: dict[str, Command] = {
     "rig info": rig.info,
     "prior train": prior.train,
     "prior evaluate": prior.evaluate,
+    "prior picture": prior.picture,
     "train": avatar.train,
     "evaluate": avatar.evaluate,
     "render": avatar.render,

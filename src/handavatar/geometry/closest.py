@@ -71,9 +71,9 @@ def closest_on_mesh(
 ) -> ClosestPoints:
     """Nearest points of a surface, on the CPU, without gradient.
 
-    A k-d tree over the faces' middles offers candidates. A point is done when the next middle is
-    so far that no face about it can be nearer than the best found: middles are at most the
-    largest face's radius from any of its points.
+    K-d trees over the faces' middles, one for each size of faces, offer candidates. A point is
+    done with a size when the next middle is so far that no face about it can be nearer than the
+    best found: middles are at most the largest face's radius from any of its points.
 
     Raises:
         ValueError: if there is no face, or a coordinate is not finite.
@@ -89,26 +89,50 @@ def closest_on_mesh(
             )
     corners = vertices.detach().double().cpu()[faces.cpu()]
     places = points.detach().double().cpu()
-    middles = corners.mean(1)
-    radius = float((corners - middles[:, None]).norm(dim=-1).max())
-    tree = cKDTree(middles.numpy())
-    distances = torch.full((len(places),), torch.inf, dtype=torch.float64)
-    indices = torch.zeros(len(places), dtype=torch.int64)
-    positions = places.clone()
-    waiting, count = torch.arange(len(places)), 8
+    radii = (corners - corners.mean(1, keepdim=True)).norm(dim=-1).amax(1)
+    found = ClosestPoints(
+        torch.full((len(places),), torch.inf, dtype=torch.float64),
+        torch.zeros(len(places), dtype=torch.int64),
+        places.clone(),
+    )
+    # Few large faces, such as the fan that seals a wrist, must not widen the search for all.
+    sizes = torch.frexp(radii).exponent
+    sizes = sizes.clamp_min(int(sizes.max()) - 12)
+    values, counts = sizes.unique(return_counts=True)
+    for size in values[counts.argsort(descending=True)]:
+        _improve(found, places, corners, (sizes == size).nonzero()[:, 0], radii)
+    return ClosestPoints(
+        found.distances.to(points), found.faces.to(points.device), found.positions.to(points)
+    )
+
+
+def _improve(
+    best: ClosestPoints, places: Tensor, corners: Tensor, chosen: Tensor, radii: Tensor
+) -> None:
+    """Writes into ``best`` what is nearer on the chosen faces."""
+    triangles, own_radii = corners[chosen], radii[chosen]
+    radius = float(own_radii.max())
+    tree = cKDTree(triangles.mean(1).numpy())
+    waiting, done, count = torch.arange(len(places)), 0, 1
     while len(waiting):
-        count = min(count, len(corners))
+        count = min(count, len(triangles))
         unsettled = []
         for own in waiting.split(max(_PAIRS_AT_ONCE // count, 1)):
-            reach, near = tree.query(places[own].numpy(), k=np.arange(1, count + 1))
-            candidates = torch.from_numpy(near)
-            asked = places[own][:, None].expand(-1, count, -1)
-            found = closest_on_triangles(asked, corners[candidates])
-            best, choice = (found - asked).norm(dim=-1).min(1)
-            rows = torch.arange(len(own))
-            distances[own], indices[own] = best, candidates[rows, choice]
-            positions[own] = found[rows, choice]
-            unsettled.append(own[torch.from_numpy(reach[:, -1]) < best + radius])
-        waiting = torch.cat(unsettled) if count < len(corners) else waiting[:0]
-        count *= 4
-    return ClosestPoints(distances.to(points), indices.to(points.device), positions.to(points))
+            reach, near = tree.query(places[own].numpy(), k=np.arange(done + 1, count + 1))
+            reach, candidates = torch.from_numpy(reach), torch.from_numpy(near)
+            row, column = (reach - own_radii[candidates] < best.distances[own, None]).nonzero().T
+            asked, faces = own[row], candidates[row, column]
+            found = closest_on_triangles(places[asked], triangles[faces])
+            distances = (found - places[asked]).norm(dim=-1)
+            nearest = best.distances.scatter_reduce(0, asked, distances, "amin")
+            wins = (distances == nearest[asked]) & (distances < best.distances[asked])
+            # Of equally near faces the first; rows are in order, so equal points are neighbours.
+            pair = wins.nonzero()[:, 0]
+            pair = pair[asked[pair] != torch.cat([asked.new_tensor([-1]), asked[pair][:-1]])]
+            best.distances[asked[pair]] = distances[pair]
+            best.faces[asked[pair]] = chosen[faces[pair]]
+            best.positions[asked[pair]] = found[pair]
+            unsettled.append(own[reach[:, -1] < best.distances[own] + radius])
+        if count == len(triangles):
+            break
+        waiting, done, count = torch.cat(unsettled), count, 4 * count

@@ -69,10 +69,10 @@ def extract_surface(
     """The level set of a field inside a box.
 
     The coarsest grid is evaluated everywhere. Cells that the surface crosses, their neighbours and
-    the cells that hold seeds are halved, again and again; on each grid the surface is followed from
-    cell to cell wherever it leaves what has been evaluated. The result equals that of the whole
-    finest grid but for pieces of surface that no coarse cell saw, no seed touched and that lie
-    more than a coarse cell from every piece that was found.
+    the cells that hold seeds are halved, again and again (without the neighbours the last time);
+    on each grid the surface is followed from cell to cell wherever it leaves what has been
+    evaluated. The result equals that of the whole finest grid but for separate pieces so small
+    that no sample of a coarser grid lies in them.
 
     Args:
         values_of: greater inside; asked for at most ``POINTS_AT_ONCE`` points at a time.
@@ -107,8 +107,8 @@ def extract_surface(
     origin = lower.double().cpu().numpy()
     grid = _Grid(values_of, origin, cells, voxel * 2**halvings, level, lower)
     grid.examine(np.arange(int(cells.prod())))
-    for _ in range(halvings):
-        grid = grid.halved(seeds)
+    for left in reversed(range(halvings)):
+        grid = grid.halved(seeds, neighbours=left > 0)
     vertices, faces = grid.marched()
     num_dense = int((np.array(grid.cells) + 1).prod())
     return ExtractedSurface(
@@ -197,14 +197,16 @@ class _Grid:
             cells = np.unique(np.concatenate(ahead))
             cells = cells[~self.is_examined.reshape(-1)[cells]]
 
-    def halved(self, seeds: Tensor | None) -> "_Grid":
-        """The grid of half the voxel, examined near the surface and near the seeds."""
+    def halved(self, seeds: Tensor | None, neighbours: bool) -> "_Grid":
+        """The grid of half the voxel, examined where the surface and the seeds are, or near."""
         marked = self.is_crossed.copy()
         if seeds is not None and len(seeds):
             places = np.floor((seeds.double().cpu().numpy() - self.origin) / self.voxel).astype(int)
             places = places[((places >= 0) & (places < self.cells)).all(1)]
             marked[tuple(places.T)] = True
-        near = np.argwhere(binary_dilation(marked, np.ones((3, 3, 3), bool)))
+        if neighbours:
+            marked = binary_dilation(marked, np.ones((3, 3, 3), bool))
+        near = np.argwhere(marked)
         finer = _Grid(
             self.values_of,
             self.origin,

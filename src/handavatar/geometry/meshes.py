@@ -95,6 +95,9 @@ def boundary_loop(faces: Int[Tensor, "faces 3"]) -> Int[Tensor, "rim"]:
     Raises:
         ValueError: if the mesh has no boundary, or more than one.
     """
+    first, second, third = faces.unbind(-1)
+    # A face with a doubled corner borders nothing.
+    faces = faces[(first != second) & (second != third) & (third != first)]
     half_edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     directed = {(int(a), int(b)) for a, b in half_edges}
     following = {a: b for a, b in directed if (b, a) not in directed}
@@ -104,7 +107,7 @@ def boundary_loop(faces: Int[Tensor, "faces 3"]) -> Int[Tensor, "rim"]:
     loop = [start]
     while following[loop[-1]] != start:
         loop.append(following[loop[-1]])
-        if len(loop) > len(following):
+        if len(loop) > len(following) or loop[-1] not in following:
             raise ValueError("the boundary of the mesh is not a simple loop")
     if len(loop) != len(following):
         raise ValueError(

@@ -17,6 +17,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from handavatar.avatar import CheckpointError
+from handavatar.evaluate.geometry import intersection_over_union
 from handavatar.field.occupancy import PairOccupancy
 from handavatar.geometry.meshes import is_inside, sample_surface
 from handavatar.geometry.rotations import apply_rigid
@@ -274,11 +275,3 @@ def evaluate_prior(options: PriorEvaluationOptions) -> dict[str, float]:
         )
     boxes, surface = torch.tensor(scores).mean(0).tolist()
     return {"iou": (boxes + surface) / 2, "iou_boxes": boxes, "iou_surface": surface}
-
-
-def intersection_over_union(
-    predicted: Bool[Tensor, "points"], truth: Bool[Tensor, "points"]
-) -> float:
-    """1 where both are empty."""
-    union = int((predicted | truth).sum())
-    return float((predicted & truth).sum()) / union if union else 1.0
