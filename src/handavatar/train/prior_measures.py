@@ -219,7 +219,7 @@ def summarised(rows: Sequence[GeometryRow]) -> dict[str, dict[str, float | int |
     summary: dict[str, dict[str, float | int | None]] = {}
     table = [asdict(row) for row in rows]
     for name in table[0]:
-        values = [row[name] for row in table if row[name] is not None]
+        values = [float(row[name]) for row in table if row[name] is not None]
         if values:
             interval = confidence_interval(values)
             half = interval.half_width if interval.count > 1 else None
