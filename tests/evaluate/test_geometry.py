@@ -20,13 +20,13 @@ from handavatar.evaluate.geometry import (
 from handavatar.geometry.extraction import ExtractedSurface, Field
 from handavatar.geometry.meshes import unique_edges, vertex_normals
 from handavatar.hand.detail import subdivided
-from handavatar.hand.extraction import extract_hand
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import divide_into_parts
 from handavatar.hand.pose import FINGER_BONES, NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
+from handavatar.hand.surface import extract_hand
 
-RESOLUTION = 64
+RESOLUTION = 48
 
 
 def _truth(gesture: str) -> Truth:
@@ -88,9 +88,9 @@ def test_a_perfect_field_has_no_distance_and_a_swollen_one_its_swelling(
     assert distance.mean == (distance.to_truth + distance.from_truth) / 2
     thick = _extracted(flat, lambda p: torch.sigmoid(1000 * (flat.signed_distances(p) + 2e-3)))
     swollen = chamfer(thick.vertices, thick.faces, flat)
-    # The cut at the wrist does not swell.
-    assert swollen.to_truth == pytest.approx(2e-3, rel=0.15)
-    assert swollen.from_truth == pytest.approx(2e-3, rel=0.15)
+    # The cut at the wrist does not swell; chords of 4.5 mm cut the corners off fingertips.
+    assert 1.7e-3 < swollen.to_truth < 2.05e-3
+    assert 1.5e-3 < swollen.from_truth < 2.05e-3
     # A missing thumb is noticed from the truth's side only.
     kept = (exact.vertices[exact.faces][..., 2] < 0.04).all(-1)
     lost = chamfer(exact.vertices, exact.faces[kept], flat)

@@ -50,9 +50,9 @@ def _distance_slowly(point: np.ndarray, corners: np.ndarray) -> float:
 @pytest.mark.parametrize("kind", KINDS)
 def test_distances_to_triangles_agree_with_the_definition(kind: str) -> None:
     generator = torch.Generator().manual_seed(KINDS.index(kind))
-    corners = _triangles(kind, 300, generator)
+    corners = _triangles(kind, 100, generator)
     scale = float(corners.abs().max())
-    points = scale * torch.randn(300, 3, generator=generator, dtype=torch.float64)
+    points = scale * torch.randn(100, 3, generator=generator, dtype=torch.float64)
     found = closest_on_triangles(points, corners)
     expected = [
         _distance_slowly(p, c) for p, c in zip(points.numpy(), corners.numpy(), strict=True)
@@ -112,7 +112,7 @@ def test_meshes_with_faces_of_all_kinds_agree_with_every_face_in_turn() -> None:
     corners = torch.cat([0.1 * _triangles(kind, 9, generator) for kind in KINDS[:6]])
     corners = corners + torch.randn(len(corners), 1, 3, generator=generator).double()
     corners = torch.cat([corners, _triangles("random", 1, generator) * 5])
-    points = 2 * torch.randn(80, 3, generator=generator, dtype=torch.float64)
+    points = 2 * torch.randn(25, 3, generator=generator, dtype=torch.float64)
     faces = torch.arange(3 * len(corners)).reshape(-1, 3)
     found = closest_on_mesh(corners.reshape(-1, 3), faces, points)
     slow = [min(_distance_slowly(p, c) for c in corners.numpy()) for p in points.numpy()]

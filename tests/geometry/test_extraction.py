@@ -85,11 +85,11 @@ def test_logits_find_the_surface_better_than_occupancies() -> None:
 
 
 @pytest.mark.parametrize("field", [_sphere(), _torus], ids=["sphere", "torus"])
-@pytest.mark.parametrize("coarsest", [8, 16, 32])
+@pytest.mark.parametrize("coarsest", [6, 12])
 def test_adaptive_equals_dense(field: Values, coarsest: int) -> None:
-    dense = extract_surface(field, LOWER, UPPER, 64, coarsest=64)
-    adaptive = extract_surface(field, LOWER, UPPER, 64, coarsest=coarsest)
-    assert dense.num_evaluations == dense.num_dense == adaptive.num_dense == 65**3
+    dense = extract_surface(field, LOWER, UPPER, 48, coarsest=48)
+    adaptive = extract_surface(field, LOWER, UPPER, 48, coarsest=coarsest)
+    assert dense.num_evaluations == dense.num_dense == adaptive.num_dense == 49**3
     assert adaptive.num_evaluations < 0.4 * dense.num_evaluations
     assert _same(adaptive, dense)
     assert _solid(adaptive).is_watertight

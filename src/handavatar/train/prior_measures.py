@@ -22,11 +22,11 @@ from handavatar.evaluate.geometry import (
 )
 from handavatar.field.occupancy import PairOccupancy
 from handavatar.geometry.extraction import Field, num_components
-from handavatar.hand.extraction import extract_hand
 from handavatar.hand.parts import PartBoxes, divide_into_parts
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations, resolve_penetration, sample_poses
 from handavatar.hand.rig import PosedHand, Rig
+from handavatar.hand.surface import extract_hand
 from handavatar.train.prior import EVALUATION_SEED, sample_points
 
 

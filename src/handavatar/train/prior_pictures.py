@@ -15,12 +15,12 @@ from handavatar.field.occupancy import PairOccupancy
 from handavatar.geometry.cameras import Camera, look_at
 from handavatar.geometry.extraction import Field
 from handavatar.hand.detail import subdivided
-from handavatar.hand.extraction import extract_hand
 from handavatar.hand.open_hand import Level, load_open_hand
 from handavatar.hand.parts import divide_into_parts
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
+from handavatar.hand.surface import extract_hand
 from handavatar.render.shaded import shaded_mesh
 from handavatar.train.prior import SHIPPED_PRIOR, load_prior
 

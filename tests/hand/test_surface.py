@@ -10,12 +10,12 @@ from torch import Tensor
 from handavatar.field.occupancy import PairOccupancy
 from handavatar.geometry.extraction import ExtractedSurface, extract_surface, num_components
 from handavatar.geometry.rotations import apply_rigid
-from handavatar.hand.extraction import extract_hand
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import Parts, divide_into_parts
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand, Rig, RigError
+from handavatar.hand.surface import extract_hand
 from handavatar.train.prior import load_prior
 
 
@@ -41,7 +41,7 @@ def _fist(rig: Rig) -> PosedHand:
 
 
 def _surface(
-    prior: PairOccupancy, parts: Parts, hand: PosedHand, resolution: int = 32
+    prior: PairOccupancy, parts: Parts, hand: PosedHand, resolution: int = 24
 ) -> ExtractedSurface:
     with torch.no_grad():
         codes = prior.encode(parts, hand)
