@@ -21,7 +21,6 @@ from handavatar.train.prior import (
     PriorEvaluationOptions,
     PriorOptions,
     evaluate_prior,
-    intersection_over_union,
     labelled_pose,
     load_prior,
     open_prior,
@@ -78,13 +77,6 @@ def test_labelled_points_lie_about_the_hand_and_their_labels_are_true() -> None:
     assert float(distances.max()) < 0.06
     # Half lie near the surface: 4 mm at most of noise, and vertices some 5 mm apart.
     assert float((distances[200:] < 0.02).float().mean()) > 0.95
-
-
-def test_intersection_over_union() -> None:
-    a, b = torch.tensor([1, 1, 0, 0]).bool(), torch.tensor([1, 0, 1, 0]).bool()
-    assert intersection_over_union(a, b) == pytest.approx(1 / 3)
-    assert intersection_over_union(a, a) == 1
-    assert intersection_over_union(~(a | ~a), ~(a | ~a)) == 1
 
 
 def test_broken_priors_are_refused(tmp_path: Path) -> None:

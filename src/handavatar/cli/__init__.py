@@ -25,6 +25,7 @@ COMMANDS: dict[str, Command] = {
     "rig import-mano": rig.import_mano,
     "prior train": prior.train,
     "prior evaluate": prior.evaluate,
+    "prior picture": prior.picture,
     "train": avatar.train,
     "evaluate": avatar.evaluate,
     "render": avatar.render,

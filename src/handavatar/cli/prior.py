@@ -22,3 +22,13 @@ def evaluate(words: list[str]) -> int:
     options, extras = parse_with(PriorEvaluationOptions, (JSON,), words, "prior evaluate")
     (print_json if extras["json"] else print_figures)(evaluate_prior(options))
     return 0
+
+
+def picture(words: list[str]) -> int:
+    """Show the surfaces of priors side by side: flat, fist, pinch, crossed fingers."""
+    from handavatar.cli.arguments import parse
+    from handavatar.train.prior_pictures import PriorPictureOptions, picture_priors
+
+    for path in picture_priors(parse(PriorPictureOptions, words, "prior picture")):
+        print(path)
+    return 0

@@ -1,7 +1,7 @@
 """Triangle meshes: normals, subdivision, surface sampling, inside test, distances, Laplacian.
 
-Lengths in metres, faces wound counter-clockwise seen from outside. Inside tests and closest
-points run in libigl on the CPU; everything else is torch on the tensors' own device.
+Lengths in metres, faces wound counter-clockwise seen from outside. Inside tests (libigl) and
+distances run on the CPU; everything else is torch on the tensors' own device.
 """
 
 from dataclasses import dataclass
@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
+
+from handavatar.geometry.closest import closest_on_mesh
 
 
 def face_cross_products(
@@ -93,6 +95,9 @@ def boundary_loop(faces: Int[Tensor, "faces 3"]) -> Int[Tensor, "rim"]:
     Raises:
         ValueError: if the mesh has no boundary, or more than one.
     """
+    first, second, third = faces.unbind(-1)
+    # A face with a doubled corner borders nothing.
+    faces = faces[(first != second) & (second != third) & (third != first)]
     half_edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     directed = {(int(a), int(b)) for a, b in half_edges}
     following = {a: b for a, b in directed if (b, a) not in directed}
@@ -102,7 +107,7 @@ def boundary_loop(faces: Int[Tensor, "faces 3"]) -> Int[Tensor, "rim"]:
     loop = [start]
     while following[loop[-1]] != start:
         loop.append(following[loop[-1]])
-        if len(loop) > len(following):
+        if len(loop) > len(following) or loop[-1] not in following:
             raise ValueError("the boundary of the mesh is not a simple loop")
     if len(loop) != len(following):
         raise ValueError(
@@ -215,12 +220,7 @@ def distance_to_mesh(
     points: Float[Tensor, "points 3"],
 ) -> Float[Tensor, "points"]:
     """Unsquared distance in metres to the nearest point of the surface, without gradient."""
-    squared, _, _ = igl.point_mesh_squared_distance(
-        np.ascontiguousarray(points.detach().cpu().double().numpy()),
-        np.ascontiguousarray(vertices.detach().cpu().double().numpy()),
-        np.ascontiguousarray(faces.cpu().numpy().astype(np.int64)),
-    )
-    return torch.from_numpy(np.sqrt(np.maximum(squared, 0))).to(points)
+    return closest_on_mesh(vertices, faces, points).distances
 
 
 def uniform_laplacian(

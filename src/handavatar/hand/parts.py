@@ -13,6 +13,7 @@ from torch import Tensor
 from handavatar.geometry.meshes import (
     SurfacePoints,
     distance_between_sets,
+    face_cross_products,
     sample_surface_evenly,
 )
 from handavatar.geometry.rotations import apply_rigid, invert_rigid
@@ -111,7 +112,7 @@ def divide_into_parts(rig: Rig, points_per_part: int = 256, seed: int = 0) -> Pa
         seed: of the surface sampling.
 
     Raises:
-        RigError: if a bone owns no face.
+        RigError: if a bone owns no face, or none with an area.
 
     Source: paper Sec. 3.2 (N^p = 256 points per part, uniform).
     Departs: the points are drawn once, evenly spread, and stay fixed, so that inference is
@@ -135,6 +136,11 @@ def divide_into_parts(rig: Rig, points_per_part: int = 256, seed: int = 0) -> Pa
         candidates = faces[torch.isin(face_labels, torch.tensor(family))]
         distance = distance_between_sets(vertices, vertices[own.unique()])
         extended = candidates[(distance[candidates] < EXTENSION).all(-1)]
+        if not float(face_cross_products(vertices, own).abs().max()) > 0:
+            raise RigError(
+                f"rig {rig.name}: the {len(own)} faces of bone {bone} have no area, so no point "
+                "can lie on them; check the template's vertices"
+            )
         half = points_per_part // 2
         clouds: list[SurfacePoints] = [
             sample_surface_evenly(vertices, own, half, generator),

@@ -108,8 +108,15 @@ class Rig:
 
     @cached_property
     def rim(self) -> Int[Tensor, "rim"]:
-        """The open wrist loop, ordered."""
-        return boundary_loop(self.faces.cpu()).to(self.faces.device)
+        """The open wrist loop, ordered.
+
+        Raises:
+            RigError: if the mesh is not open at one place, the wrist.
+        """
+        try:
+            return boundary_loop(self.faces.cpu()).to(self.faces.device)
+        except ValueError as error:
+            raise RigError(f"rig {self.name}: {error}; expected one hole, the wrist") from error
 
     @cached_property
     def sealed_faces(self) -> Int[Tensor, "sealed_faces 3"]:

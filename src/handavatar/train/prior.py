@@ -19,6 +19,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from handavatar.avatar import CheckpointError
+from handavatar.evaluate.geometry import intersection_over_union
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
 from handavatar.geometry.meshes import is_inside, sample_surface
 from handavatar.geometry.rotations import apply_rigid
@@ -341,11 +342,3 @@ def pose_scores(
             ]
         )
     return torch.tensor(scores)
-
-
-def intersection_over_union(
-    predicted: Bool[Tensor, "points"], truth: Bool[Tensor, "points"]
-) -> float:
-    """1 where both are empty."""
-    union = int((predicted | truth).sum())
-    return float((predicted & truth).sum()) / union if union else 1.0

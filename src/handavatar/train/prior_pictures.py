@@ -1,0 +1,137 @@
+"""Pictures of occupancy priors: the extracted meshes of telling poses, side by side."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from handavatar.evaluate.geometry import Skin, Truth
+from handavatar.field.decoders import OccupancyField
+from handavatar.geometry.cameras import Camera, look_at
+from handavatar.geometry.extraction import Field
+from handavatar.hand.detail import subdivided
+from handavatar.hand.open_hand import Level, load_open_hand
+from handavatar.hand.parts import divide_into_parts
+from handavatar.hand.pose import HandPose
+from handavatar.hand.pose_sampling import gesture_rotations
+from handavatar.hand.rig import PosedHand
+from handavatar.hand.surface import extract_hand
+from handavatar.render.shaded import shaded_mesh
+from handavatar.train.prior import SHIPPED_PRIOR, open_prior
+
+POSES = ("flat", "fist", "pinch", "crossed_fingers")
+VIEWS: dict[str, tuple[float, float, float]] = {
+    "palm": (0.0, -1.0, 0.0),
+    "thumb side": (0.0, 0.0, 1.0),
+    "back": (0.0, 1.0, 0.0),
+    "little side": (0.0, 0.0, -1.0),
+}
+"""Where the camera stands, in the hand's rest axes."""
+
+_DISTANCE = 1.2
+_TITLE = 18
+
+FieldOf = Callable[[PosedHand], Field]
+"""The occupancy of a posed hand."""
+
+
+@dataclass(frozen=True)
+class PriorPictureOptions:
+    """Which priors to look at, and how.
+
+    Attributes:
+        out: folder for one picture per pose: a row per prior, a column per side.
+        priors: the weights; by default those that ship.
+        resolution: cells along the longest side of the extraction's box.
+        size: edge of one picture, pixels.
+        level: which open hand.
+        rounds: midpoint subdivisions.
+        truth: adds a row of the guiding mesh, extracted in the same way.
+    """
+
+    out: Path
+    priors: tuple[Path, ...] = (SHIPPED_PRIOR,)
+    resolution: int = 256
+    size: int = 320
+    level: Level = "full"
+    rounds: int = 1
+    truth: bool = True
+
+
+def picture_priors(options: PriorPictureOptions) -> list[Path]:
+    """Writes a picture of each of ``POSES``.
+
+    Raises:
+        CheckpointError: if a prior cannot be read.
+    """
+    base = load_open_hand(options.level)
+    rig = subdivided(base, options.rounds)
+    parts, skin = divide_into_parts(rig), Skin.of(rig)
+    fields: dict[str, FieldOf] = {}
+    for path in options.priors:
+        prior = open_prior(path)
+
+        def occupancy_of(hand: PosedHand, prior: OccupancyField = prior) -> Field:
+            with torch.no_grad():
+                codes = prior.encode(parts, hand)
+            return lambda points: prior(codes, points).whole
+
+        fields[str(path) if path.stem in fields else path.stem] = occupancy_of
+    if options.truth:
+        fields["guiding mesh"] = lambda hand: Truth(hand, skin).occupancy
+    options.out.mkdir(parents=True, exist_ok=True)
+    written = []
+    for pose in POSES:
+        hand = rig.shaped().posed(HandPose(gesture_rotations(base, pose), torch.zeros(3)))
+        boxes = parts.boxes(hand, 0.0)
+        meshes = {}
+        for name, field_of in fields.items():
+            surface = extract_hand(field_of(hand), boxes, hand, options.resolution)
+            meshes[name] = (surface.vertices, surface.faces)
+        path = options.out / f"{pose}.png"
+        Image.fromarray(side_by_side(meshes, hand.vertices, options.size)).save(path)
+        written.append(path)
+    return written
+
+
+def side_by_side(
+    meshes: Mapping[str, tuple[Tensor, Tensor]], frame: Tensor, size: int
+) -> UInt8[np.ndarray, "height width 3"]:
+    """A row per mesh (vertices, faces), a column per side; all through the same cameras.
+
+    Args:
+        meshes: by title.
+        frame: points (metres) that fill every picture.
+        size: edge of one picture, pixels.
+    """
+    lower, upper = frame.amin(0), frame.amax(0)
+    middle, reach = (lower + upper) / 2, float((upper - lower).max())
+    focal = 0.92 * size * (_DISTANCE - reach / 2) / reach
+    cameras = {
+        name: Camera(
+            (focal, focal),
+            (size / 2, size / 2),
+            size,
+            size,
+            look_at(
+                middle + _DISTANCE * torch.tensor(direction), middle, torch.tensor([-1.0, 0, 0])
+            ),
+        )
+        for name, direction in VIEWS.items()
+    }
+    rows = []
+    for title, (vertices, faces) in meshes.items():
+        pictures = [shaded_mesh(vertices, faces, camera) for camera in cameras.values()]
+        strip = (torch.cat(pictures, dim=1) * 255).round().to(torch.uint8).numpy()
+        head = Image.new("RGB", (strip.shape[1], _TITLE), (255, 255, 255))
+        draw = ImageDraw.Draw(head)
+        for column, side in enumerate(cameras):
+            text = f"{title}: {side}" if column == 0 else side
+            draw.text((column * size + 4, 3), text, fill=(60, 60, 60))
+        rows += [np.asarray(head), strip]
+    return np.concatenate(rows)
