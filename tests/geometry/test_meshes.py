@@ -10,6 +10,7 @@ from torch import Tensor
 
 from handavatar.geometry.meshes import (
     boundary_loop,
+    closest_points,
     distance_between_sets,
     distance_to_mesh,
     face_cross_products,
@@ -19,6 +20,7 @@ from handavatar.geometry.meshes import (
     sample_surface_evenly,
     subdivide_midpoint,
     uniform_laplacian,
+    uniform_laplacian_matrix,
     unique_edges,
     vertex_normals,
     winding_number,
@@ -211,3 +213,53 @@ def test_the_laplacian_of_a_flat_even_grid_vanishes_inside() -> None:
     laplacian = uniform_laplacian(vertices, torch.cat([right, down])).reshape(5, 5, 3)
     assert float(laplacian[1:-1, 1:-1].abs().max()) < 1e-6
     assert float(laplacian[0, 0].norm()) > 0.1
+
+
+def _nearest_slowly(corners: Tensor, point: Tensor) -> Tensor:
+    """Of a dense barycentric grid that is then refined about its best point."""
+    best = torch.tensor([1.0, 1.0, 1.0]).double() / 3
+    width = 1.0
+    steps = torch.linspace(-1, 1, 21).double()
+    for _ in range(24):
+        u, v = torch.meshgrid(best[0] + width * steps, best[1] + width * steps, indexing="ij")
+        weights = torch.stack([u, v, 1 - u - v], dim=-1).reshape(-1, 3).clamp_min(0)
+        weights = weights / weights.sum(-1, keepdim=True)
+        best = weights[(weights @ corners - point).norm(dim=-1).argmin()]
+        width *= 0.5
+    return best @ corners
+
+
+def test_closest_points_agree_with_a_search_over_each_triangle() -> None:
+    """Random triangles, slivers, and triangles that are segments or points."""
+    generator = torch.Generator().manual_seed(0)
+    vertices = torch.rand(36, 3, generator=generator).double()
+    vertices[14] = vertices[12] + 0.3 * (vertices[13] - vertices[12])
+    vertices[17] = vertices[16] = vertices[15]
+    vertices[20] = vertices[18] + 0.5 * (vertices[19] - vertices[18]) + 1e-9
+    faces = torch.arange(36).view(12, 3)
+    points = 2 * torch.rand(30, 3, generator=generator).double() - 0.5
+    found = closest_points(vertices, faces, points)
+    distance = distance_to_mesh(vertices, faces, points)
+    torch.testing.assert_close((found - points).norm(dim=-1), distance)
+    for point, far in zip(points, distance, strict=True):
+        slow = min(float((_nearest_slowly(vertices[face], point) - point).norm()) for face in faces)
+        # The search ends at a grid of 1e-8, slanted by its clamping.
+        assert math.isclose(float(far), slow, abs_tol=1e-6)
+
+
+def test_closest_points_agree_with_trimesh() -> None:
+    vertices, faces = _sphere(2)
+    points = torch.randn(200, 3, generator=torch.Generator().manual_seed(1)).double()
+    mesh = trimesh.Trimesh(vertices.numpy(), faces.numpy(), process=False)
+    nearest, _, _ = trimesh.proximity.closest_point_naive(mesh, points.numpy())
+    torch.testing.assert_close(closest_points(vertices, faces, points), torch.tensor(nearest))
+
+
+def test_the_laplacian_as_a_matrix_is_the_laplacian() -> None:
+    vertices, faces = _sphere(2)
+    edges = unique_edges(faces)
+    matrix = uniform_laplacian_matrix(edges, len(vertices))
+    product = torch.sparse.mm(matrix, vertices.float())
+    torch.testing.assert_close(
+        product, uniform_laplacian(vertices.float(), edges), atol=1e-6, rtol=0
+    )

@@ -209,18 +209,41 @@ def is_inside(
     return winding_number(vertices, faces, points) > 0.5
 
 
+def closest_points(
+    vertices: Float[Tensor, "vertices 3"],
+    faces: Int[Tensor, "faces 3"],
+    points: Float[Tensor, "points 3"],
+) -> Float[Tensor, "points 3"]:
+    """The nearest point of the surface to each point, without gradient.
+
+    Triangles are never replaced by their edges, and those without area count as the segments or
+    points that they are.
+
+    Source: paper appendix A, the faces' side of ``Cham``.
+    """
+    _, _, nearest = _nearest_on_mesh(vertices, faces, points)
+    return torch.from_numpy(np.asarray(nearest)).to(points)
+
+
 def distance_to_mesh(
     vertices: Float[Tensor, "vertices 3"],
     faces: Int[Tensor, "faces 3"],
     points: Float[Tensor, "points 3"],
 ) -> Float[Tensor, "points"]:
     """Unsquared distance in metres to the nearest point of the surface, without gradient."""
-    squared, _, _ = igl.point_mesh_squared_distance(
+    squared, _, _ = _nearest_on_mesh(vertices, faces, points)
+    return torch.from_numpy(np.sqrt(np.maximum(squared, 0))).to(points)
+
+
+def _nearest_on_mesh(
+    vertices: Tensor, faces: Tensor, points: Tensor
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Squared distance, face and place of the nearest surface point; float64 inside."""
+    return igl.point_mesh_squared_distance(  # type: ignore[no-any-return]
         np.ascontiguousarray(points.detach().cpu().double().numpy()),
         np.ascontiguousarray(vertices.detach().cpu().double().numpy()),
         np.ascontiguousarray(faces.cpu().numpy().astype(np.int64)),
     )
-    return torch.from_numpy(np.sqrt(np.maximum(squared, 0))).to(points)
 
 
 def uniform_laplacian(
@@ -238,6 +261,20 @@ def uniform_laplacian(
     total = total.index_add(-2, second, vertices[..., first, :])
     valence = torch.bincount(edges.reshape(-1), minlength=vertices.shape[-2]).clamp_min(1)
     return total / valence[:, None].to(vertices) - vertices
+
+
+def uniform_laplacian_matrix(
+    edges: Int[Tensor, "edges 2"], num_vertices: int
+) -> Float[Tensor, "vertices vertices"]:
+    """Sparse matrix whose product with the vertices is :func:`uniform_laplacian`."""
+    valence = torch.bincount(edges.reshape(-1), minlength=num_vertices).clamp_min(1)
+    vertex = torch.arange(num_vertices, device=edges.device)
+    row = torch.cat([edges[:, 0], edges[:, 1], vertex])
+    column = torch.cat([edges[:, 1], edges[:, 0], vertex])
+    share = torch.cat([1 / valence[row[: 2 * len(edges)]], -torch.ones_like(vertex).float()])
+    size = (num_vertices, num_vertices)
+    index = torch.stack([row, column])
+    return torch.sparse_coo_tensor(index, share, size, check_invariants=True).coalesce()
 
 
 def distance_between_sets(
