@@ -21,7 +21,7 @@ EXACTLY = {
     ),
     "hand.rig": "PosedHand Rig RigError ShapedHand",
     "hand.open_hand": "Level load_open_hand",
-    "hand.detail": "subdivided",
+    "hand.detail": "refined subdivided",
     "edit": "Edit bones_named",
     "avatar": (
         "CheckpointError HandAvatar HandState RayValues RenderSettings Rendering SCHEMA "
@@ -42,6 +42,8 @@ AT_LEAST = {
     "capture.synthetic": "SynthOptions make_capture",
     "train.loop": "TrainOptions train",
     "train.prior": "PriorOptions train_prior PriorEvaluationOptions evaluate_prior",
+    "hand.skin_refinement": "RefinementOptions SkinRefinement refine_skin",
+    "hand.sparse_skin": "SparseSkin SparseSkin.load SparseSkin.save",
     "evaluate.run": "EvaluateOptions evaluate_run",
     "doctor": "Finding examine",
     "cli": "main",
