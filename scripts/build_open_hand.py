@@ -810,6 +810,10 @@ others, who released the base mesh and its targets as CC0 in September 2020.
 
 No part of MANO, SMPL or any of their data went into these files.
 
+`skin_full_2.safetensors` and `skin_778_2.safetensors` hold refined skinning weights of these two meshes
+after two midpoint subdivisions, made from them alone by `handavatar rig refine --level full` and
+`--level 778`. They derive from the same weights and stand under the same licence as those (Apache 2.0).
+
 | file | SHA-256 |
 |---|---|
 {digests}

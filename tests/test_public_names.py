@@ -26,7 +26,7 @@ EXACTLY = {
         "growth_agreement read_mano"
     ),
     "hand.rigs": "SCHEMA find_rig load_rig read_rig rigs_folder save_rig",
-    "hand.detail": "subdivided",
+    "hand.detail": "refined subdivided",
     "edit": "Edit bones_named",
     "avatar": (
         "CheckpointError HandAvatar HandState RayValues RenderSettings Rendering SCHEMA "
@@ -47,6 +47,8 @@ AT_LEAST = {
     "capture.synthetic": "SynthOptions make_capture",
     "train.loop": "TrainOptions train",
     "train.prior": "PriorOptions train_prior PriorEvaluationOptions evaluate_prior open_prior",
+    "hand.skin_refinement": "RefinementOptions SkinRefinement refine_skin",
+    "hand.sparse_skin": "SparseSkin SparseSkin.load SparseSkin.save",
     "evaluate.run": "EvaluateOptions evaluate_run",
     "doctor": "Finding examine",
     "cli": "main",

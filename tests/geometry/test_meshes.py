@@ -19,6 +19,7 @@ from handavatar.geometry.meshes import (
     sample_surface_evenly,
     subdivide_midpoint,
     uniform_laplacian,
+    uniform_laplacian_matrix,
     unique_edges,
     vertex_normals,
     winding_number,
@@ -211,3 +212,13 @@ def test_the_laplacian_of_a_flat_even_grid_vanishes_inside() -> None:
     laplacian = uniform_laplacian(vertices, torch.cat([right, down])).reshape(5, 5, 3)
     assert float(laplacian[1:-1, 1:-1].abs().max()) < 1e-6
     assert float(laplacian[0, 0].norm()) > 0.1
+
+
+def test_the_laplacian_as_a_matrix_is_the_laplacian() -> None:
+    vertices, faces = _sphere(2)
+    edges = unique_edges(faces)
+    matrix = uniform_laplacian_matrix(edges, len(vertices))
+    product = torch.sparse.mm(matrix, vertices.float())
+    torch.testing.assert_close(
+        product, uniform_laplacian(vertices.float(), edges), atol=1e-6, rtol=0
+    )

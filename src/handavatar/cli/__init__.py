@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from handavatar import __version__
-from handavatar.cli import avatar, capture, default, prior, rig
+from handavatar.cli import avatar, bench, capture, default, prior, rig
 from handavatar.cli.failures import USAGE, report_failure
 
 Command = Callable[[list[str]], int]
@@ -23,11 +23,13 @@ COMMANDS: dict[str, Command] = {
     "capture check": capture.check,
     "rig info": rig.info,
     "rig import-mano": rig.import_mano,
+    "rig refine": rig.refine,
     "prior train": prior.train,
     "prior evaluate": prior.evaluate,
     "prior picture": prior.picture,
     "train": avatar.train,
     "evaluate": avatar.evaluate,
+    "bench": bench.bench,
     "render": avatar.render,
 }
 

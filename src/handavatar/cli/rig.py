@@ -1,4 +1,4 @@
-"""``handavatar rig``: facts of a rig, and a user's own MANO file made into one."""
+"""``handavatar rig``: facts of a rig, MANO files made into one, refined skinning weights."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,3 +87,64 @@ def _facts(rig: "Rig") -> dict[str, Any]:
         "high_resolution": {"vertices": fine.num_vertices, "faces": len(fine.faces)},
         "sha256": rig.sha256,
     }
+
+
+def refine(words: list[str]) -> int:
+    """Refine the skinning weights of the high-resolution rig; four bones per vertex."""
+    import json
+    from dataclasses import asdict
+
+    from handavatar.cli.arguments import JSON, Extra, parse_with, print_figures, print_json
+    from handavatar.evaluate.skin_table import evaluation_poses, measure_skin
+    from handavatar.hand.open_hand import Level, load_open_hand
+    from handavatar.hand.skin_refinement import (
+        RefinementOptions,
+        RefinementState,
+        SkinRefinement,
+        refine_skin,
+    )
+    from handavatar.hand.sparse_skin import SparseSkin
+    from handavatar.train.progress import Progress
+
+    extras_wanted = (
+        Extra("out", Path, "file to write (safetensors)", Path("skin.safetensors")),
+        Extra("level", Level, "full is the default rig, 778 the one of MANO's size", "full"),
+        Extra("rounds", int, "midpoint subdivisions", 2),
+        Extra("resume", bool, "continue from OUT.part, which a stopped run has left", False),
+        JSON,
+    )
+    options, extras = parse_with(RefinementOptions, extras_wanted, words, "rig refine")
+    out: Path = extras["out"]
+    base = load_open_hand(extras["level"])
+    problem = SkinRefinement.of(base, extras["rounds"], options)
+    part = out.with_name(out.name + ".part")
+    is_continued = extras["resume"] and part.is_file()
+    state = RefinementState.load(part, problem) if is_continued else problem.begin()
+    with Progress("rig refine", problem.total_steps, state.step) as progress:
+
+        def report(now: RefinementState, figures: dict[str, float]) -> None:
+            progress.update(now.step, "refit" if now.step > options.steps else "", **figures)
+            if now.step % 50 == 0:
+                now.save(part, problem)
+
+        skins = refine_skin(problem, state, report)
+    made = SparseSkin.of(skins.fitted, base, extras["rounds"])
+    made.save(out, {"rig": base.name, "options": json.dumps(asdict(options))})
+    part.unlink(missing_ok=True)
+    poses = evaluation_poses(base, 20)
+    rows = {
+        "averaged": problem.fine.skin_weights,
+        "refined, any number of bones": skins.free,
+        "cut to four bones": skins.projected,
+        "fitted again": made.dense(),
+    }
+    figures = {
+        name: measure_skin(base, problem.fine, weights, poses).summary()
+        for name, weights in rows.items()
+    }
+    if extras["json"]:
+        print_json({"file": str(out), "figures": figures})
+    else:
+        print_figures(figures)
+        print(f"skin weights: {out}")
+    return 0

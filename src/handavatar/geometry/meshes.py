@@ -240,6 +240,20 @@ def uniform_laplacian(
     return total / valence[:, None].to(vertices) - vertices
 
 
+def uniform_laplacian_matrix(
+    edges: Int[Tensor, "edges 2"], num_vertices: int
+) -> Float[Tensor, "vertices vertices"]:
+    """Sparse matrix whose product with the vertices is :func:`uniform_laplacian`."""
+    valence = torch.bincount(edges.reshape(-1), minlength=num_vertices).clamp_min(1)
+    vertex = torch.arange(num_vertices, device=edges.device)
+    row = torch.cat([edges[:, 0], edges[:, 1], vertex])
+    column = torch.cat([edges[:, 1], edges[:, 0], vertex])
+    share = torch.cat([1 / valence[row[: 2 * len(edges)]], -torch.ones_like(vertex).float()])
+    size = (num_vertices, num_vertices)
+    index = torch.stack([row, column])
+    return torch.sparse_coo_tensor(index, share, size, check_invariants=True).coalesce()
+
+
 def distance_between_sets(
     points: Float[Tensor, "points 3"], others: Float[Tensor, "others 3"]
 ) -> Float[Tensor, "points"]:

@@ -1,11 +1,17 @@
 """The high-resolution rig ("MANO-HD"): midpoint subdivision that carries everything."""
 
 from dataclasses import replace
+from importlib import resources
+from pathlib import Path
 
 import torch
 
 from handavatar.geometry.meshes import Subdivision, subdivide_midpoint
-from handavatar.hand.rig import Rig
+from handavatar.hand.rig import Rig, RigError
+from handavatar.hand.sparse_skin import SparseSkin
+
+_SHIPPED = ("skin_full_2.safetensors", "skin_778_2.safetensors")
+"""Made with ``handavatar rig refine --level full`` and ``--level 778``."""
 
 
 def subdivided(rig: Rig, rounds: int = 2) -> Rig:
@@ -18,11 +24,45 @@ def subdivided(rig: Rig, rounds: int = 2) -> Rig:
         rig: any rig.
         rounds: each multiplies the faces by four; the paper uses two.
 
-    Source: paper Sec. 3.1. Refined skinning weights are another step (appendix A).
+    Source: paper Sec. 3.1. Refined skinning weights are another step: :func:`refined`.
     """
     for _ in range(rounds):
         rig = _subdivided_once(rig)
     return rig
+
+
+def refined(rig: Rig, rounds: int = 2, file: Path | None = None) -> Rig:
+    """A finer rig with refined skinning weights, at most four bones per vertex.
+
+    Without ``file`` it takes the weights that ship for this very rig and number of rounds; where
+    none do, it is :func:`subdivided`, with averaged weights.
+
+    Args:
+        rig: any rig.
+        rounds: midpoint subdivisions.
+        file: weights written by ``handavatar rig refine``.
+
+    Raises:
+        RigError: if the file is damaged or was made for another rig.
+
+    Source: paper appendix A, optimization of MANO-HD.
+    """
+    fine = subdivided(rig, rounds)
+    if file is not None:
+        skin = SparseSkin.load(file)
+        if not skin.fits(rig, rounds):
+            raise RigError(
+                f"{file}: made for a rig with fingerprint {skin.rig_sha256[:12]} and "
+                f"{skin.rounds} rounds, expected {rig.sha256[:12]} ({rig.name}) and {rounds}; "
+                "make them with `handavatar rig refine`"
+            )
+        return replace(fine, skin_weights=skin.dense().to(fine.skin_weights))
+    for name in _SHIPPED:
+        with resources.as_file(resources.files("handavatar") / "assets" / name) as path:
+            skin = SparseSkin.load(path)
+        if skin.fits(rig, rounds):
+            return replace(fine, skin_weights=skin.dense().to(fine.skin_weights))
+    return fine
 
 
 def _subdivided_once(rig: Rig) -> Rig:

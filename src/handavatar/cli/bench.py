@@ -1,0 +1,81 @@
+"""``handavatar bench``: the paper's tables, measured here."""
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from handavatar.cli.failures import USAGE
+
+if TYPE_CHECKING:
+    from handavatar.evaluate.tables import ResultTable
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """One table: the options it takes, with ``total_steps``, and the function that makes it."""
+
+    options: type[Any]
+    make: "Callable[[Any, Callable[[int], None]], ResultTable]"
+
+
+def _skin() -> _Bench:
+    from handavatar.evaluate.skin_table import SkinTableOptions, skin_table
+
+    return _Bench(SkinTableOptions, skin_table)
+
+
+_TABLES: dict[str, Callable[[], _Bench]] = {"skin": _skin}
+"""A new table needs a line here; what it takes and makes is the business of its own module."""
+
+
+def bench(words: list[str]) -> int:
+    """Measure one of the paper's tables: ``bench --table skin``."""
+    from handavatar.cli.arguments import JSON, Extra, parse_with, print_json
+    from handavatar.train.progress import Progress
+
+    name = _named_table(words)
+    if name not in _TABLES:
+        known = f"one of: {', '.join(_TABLES)}\nits options: handavatar bench --table NAME --help"
+        if not name and {"-h", "--help"} & set(words):
+            print(f"usage: handavatar bench --table NAME\n\nNAME is {known}")
+            return 0
+        found = f"found {name!r}" if name else "--table is missing"
+        print(f"handavatar bench: {found}, expected --table with {known}", file=sys.stderr)
+        return USAGE
+    chosen = _TABLES[name]()
+    extras_wanted = (
+        Extra("table", str, f"which table: {', '.join(_TABLES)}"),
+        Extra("out", Path | None, "Markdown file to write as well", None),
+        JSON,
+    )
+    options, extras = parse_with(chosen.options, extras_wanted, words, "bench")
+    with Progress(f"bench {name}", options.total_steps) as progress:
+        table = chosen.make(options, progress.update)
+    if extras["out"] is not None:
+        _write(extras["out"], table.markdown())
+    if extras["json"]:
+        print_json(table.record())
+    else:
+        print(table.markdown())
+    return 0
+
+
+def _named_table(words: list[str]) -> str:
+    """The word after ``--table``; it decides which other options there are."""
+    for word, following in zip(words, [*words, ""][1:], strict=True):
+        if word.startswith("--table="):
+            return word.partition("=")[2]
+        if word == "--table":
+            return following
+    return ""
+
+
+def _write(path: Path, text: str) -> None:
+    """Aside first, then renamed into place."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(path.name + ".tmp")
+    aside.write_text(text, encoding="utf-8")
+    os.replace(aside, path)

@@ -1,0 +1,39 @@
+"""A table of results: numbers for programs, Markdown for people."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+
+Cell = float | int | str | None
+"""``None`` was not measured."""
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """Named rows with the same columns.
+
+    Attributes:
+        title: one line.
+        rows: by name; each maps the columns, in order, to figures.
+        notes: what a reader must know to judge the figures.
+    """
+
+    title: str
+    rows: Mapping[str, Mapping[str, Cell]]
+    notes: tuple[str, ...] = ()
+
+    def record(self) -> dict[str, object]:
+        """The table as JSON takes it."""
+        return asdict(self)
+
+    def markdown(self) -> str:
+        """The table with its title and notes."""
+        columns = list(next(iter(self.rows.values()), {}))
+        lines = ["| | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+        for name, row in self.rows.items():
+            lines.append(f"| {name} | " + " | ".join(_text(row[c]) for c in columns) + " |")
+        notes = "".join(f"\n{note}\n" for note in self.notes)
+        return f"### {self.title}\n\n" + "\n".join(lines) + "\n" + notes
+
+
+def _text(cell: Cell) -> str:
+    return "–" if cell is None else str(cell)
