@@ -1,6 +1,7 @@
 """The geometry table: alike for all decoders, paired, and honest about what it does not know."""
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +12,13 @@ import torch
 
 from handavatar.field.decoders import Decoder, OccupancyField
 from handavatar.field.occupancy import HandCodes
+from handavatar.hand.open_hand import load_open_hand
+from handavatar.hand.parts import divide_into_parts
+from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand
 from handavatar.train.comparison import ComparisonOptions, compare_decoders, comparison_table
-from handavatar.train.prior import PriorEvaluationOptions, evaluate_prior
+from handavatar.train.geometry_table import GeometryTableOptions, MeshMeasure, geometry_table
+from handavatar.train.prior import PriorEvaluationOptions, evaluate_prior, open_prior
 
 
 def _options(out: Path) -> ComparisonOptions:
@@ -140,3 +145,46 @@ def test_impossible_comparisons_are_refused(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=message):
             compare_decoders(wrong)
     assert not (tmp_path / "none").exists()
+
+
+# --- bench --table geometry -----------------------------------------------------------------------
+
+
+def test_the_table_has_a_row_per_decoder_and_says_what_it_rests_on(tmp_path: Path) -> None:
+    options = GeometryTableOptions(
+        tmp_path,
+        decoders=("pair", "coap"),
+        steps=2,
+        points=64,
+        pool=1,
+        poses=2,
+        judged_points=256,
+        measured_poses=2,
+        level="778",
+        rounds=0,
+        resolution=16,
+    )
+    told: list[int] = []
+    table = geometry_table(options, told.append)
+    assert list(table.rows) == ["pair", "coap"]
+    assert table.rows["pair"]["parameters"] == 232_513
+    assert table.rows["pair"]["IoU - pair [95 %]"] is None
+    assert "[" in str(table.rows["coap"]["IoU - pair [95 %]"])
+    # Two steps make no hand: what has no surface has no figure, never NaN.
+    cells = [cell for row in table.rows.values() for cell in row.values()]
+    assert all(not isinstance(cell, float) or math.isfinite(cell) for cell in cells)
+    assert options.total_steps == 4 and max(told, default=0) <= 4
+    assert "2 steps of 64 points" in table.markdown()
+    assert json.loads(json.dumps(table.record(), allow_nan=False)) is not None
+
+
+def test_a_good_prior_has_all_columns() -> None:
+    rig = load_open_hand("778")
+    posed = rig.shaped().posed(HandPose(torch.zeros(16, 3), torch.zeros(3)))
+    field = open_prior()
+    with torch.no_grad():
+        codes = field.encode(divide_into_parts(rig), posed)
+        found = MeshMeasure(32)(field, codes, posed)
+    assert set(found) == {"lap", "cham_from_truth", "cham", "seam", "seam_step"}
+    assert all(math.isfinite(value) for value in found.values())
+    assert 0 < found["cham"] < 30  # 1e-4 m; a voxel has some 60.

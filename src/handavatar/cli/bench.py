@@ -27,12 +27,18 @@ def _skin() -> _Bench:
     return _Bench(SkinTableOptions, skin_table)
 
 
-_TABLES: dict[str, Callable[[], _Bench]] = {"skin": _skin}
+def _geometry() -> _Bench:
+    from handavatar.train.geometry_table import GeometryTableOptions, geometry_table
+
+    return _Bench(GeometryTableOptions, geometry_table)
+
+
+_TABLES: dict[str, Callable[[], _Bench]] = {"geometry": _geometry, "skin": _skin}
 """A new table needs a line here; what it takes and makes is the business of its own module."""
 
 
 def bench(words: list[str]) -> int:
-    """Measure one of the paper's tables: ``bench --table skin``."""
+    """Measure one of the paper's tables: ``bench --table geometry|skin``."""
     from handavatar.cli.arguments import JSON, Extra, parse_with, print_json
     from handavatar.train.progress import Progress
 

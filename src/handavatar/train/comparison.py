@@ -45,7 +45,7 @@ class ComparisonOptions:
     """How decoders are compared.
 
     Attributes:
-        out: folder for the trained priors and the picture of attention maps.
+        priors: folder for the trained priors and the picture of attention maps.
         decoders: which ones; ``pair`` must be among them, the others are compared with it.
         seeds: each one trains every decoder once, all on the same data.
         steps: optimisation steps of each training.
@@ -59,7 +59,7 @@ class ComparisonOptions:
         device: where the networks train.
     """
 
-    out: Path = Path("decoders")
+    priors: Path = Path("decoders")
     decoders: tuple[Decoder, ...] = get_args(Decoder)
     seeds: tuple[int, ...] = (0,)
     steps: int = 10_000
@@ -113,7 +113,7 @@ def compare_decoders(
     Source: paper Sec. 4.2, table of geometry.
     """
     _check(options)
-    options.out.mkdir(parents=True, exist_ok=True)
+    options.priors.mkdir(parents=True, exist_ok=True)
     margin = untrained_field("pair").margin
     parts, samples = evaluation_poses(
         PriorEvaluationOptions(
@@ -138,7 +138,7 @@ def compare_decoders(
         if decoder == "transformer" and isinstance(fields[0], PartwiseOccupancy):
             attention = _attention(fields[0], options)
     value: dict[str, Any] = {
-        "options": {**asdict(options), "out": options.out.name},
+        "options": {**asdict(options), "priors": options.priors.name},
         "note": "Intervals of 95 % over poses, seeds averaged: they tell poses apart, not "
         "trainings; minus_pair_over_seeds tells trainings apart.",
         "decoders": {
@@ -202,7 +202,7 @@ def _train(
     start = time.perf_counter()
     field = train_prior(
         PriorOptions(
-            out=options.out / f"{name}.safetensors",
+            out=options.priors / f"{name}.safetensors",
             steps=options.steps,
             points=options.points,
             pool=options.pool,
@@ -279,7 +279,7 @@ def _attention(field: PartwiseOccupancy, options: ComparisonOptions) -> dict[str
             "preference_untrained": _mean_preference(attention_figures(control)),
             "parts": by_part,
         }
-    attention_picture(readings).save(options.out / "attention.png")
+    attention_picture(readings).save(options.priors / "attention.png")
     return {"picture": "attention.png", **figures}
 
 

@@ -1,0 +1,123 @@
+"""``handavatar bench --table geometry``: every decoder, by IoU and by its extracted meshes."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from handavatar.evaluate.geometry import Skin, Truth
+from handavatar.evaluate.tables import Cell, ResultTable
+from handavatar.field.decoders import OccupancyField
+from handavatar.field.occupancy import HandCodes
+from handavatar.hand.parts import divide_into_parts
+from handavatar.hand.rig import PosedHand
+from handavatar.train.comparison import ComparisonOptions, compare_decoders
+from handavatar.train.prior import EVALUATION_SEED, sample_points
+from handavatar.train.prior_measures import measure_field
+
+_MESH_COLUMNS = ("lap", "cham_from_truth", "cham", "seam", "seam_step")
+
+
+@dataclass(frozen=True)
+class GeometryTableOptions(ComparisonOptions):
+    """What is compared, and how finely meshes are extracted.
+
+    Attributes:
+        resolution: cells along the longest side of the extraction's box.
+    """
+
+    resolution: int = 128
+
+    @property
+    def total_steps(self) -> int:
+        """Of all trainings together."""
+        return self.steps * len(self.seeds) * len(self.decoders)
+
+
+class MeshMeasure:
+    """The columns of :mod:`handavatar.train.prior_measures` that every pose has.
+
+    A field without a surface has none of them: NaN.
+    """
+
+    def __init__(self, resolution: int) -> None:
+        """At a resolution of the extraction."""
+        self._resolution = resolution
+        self._skins: dict[str, Skin] = {}
+
+    def __call__(
+        self, field: OccupancyField, codes: HandCodes, posed: PosedHand
+    ) -> Mapping[str, float]:
+        """Figures of one field in one pose; lengths in 1e-4 m, angles in degrees."""
+        rig = posed.rig
+        if rig.sha256 not in self._skins:
+            self._skins[rig.sha256] = Skin.of(rig)
+        generator = torch.Generator().manual_seed(EVALUATION_SEED)
+        points = sample_points(divide_into_parts(rig), posed, 64, field.margin, generator)
+        try:
+            row = measure_field(
+                lambda places: field(codes, places).whole,
+                codes.boxes,
+                Truth(posed, self._skins[rig.sha256]),
+                points,
+                self._resolution,
+                generator,
+            )
+        except ValueError:
+            return dict.fromkeys(_MESH_COLUMNS, math.nan)
+        return {name: float(getattr(row, name)) for name in _MESH_COLUMNS}
+
+
+def geometry_table(
+    options: GeometryTableOptions, report: Callable[[int], None] | None = None
+) -> ResultTable:
+    """Trains and judges; see :func:`handavatar.train.comparison.compare_decoders`.
+
+    Args:
+        options: what to compare.
+        report: told the number of training steps done.
+
+    Source: paper Sec. 4.2, table of geometry.
+    """
+    done = dict.fromkeys(
+        (f"{decoder}-{seed}" for decoder in options.decoders for seed in options.seeds), 0
+    )
+
+    def progress(name: str, step: int, _: dict[str, float]) -> None:
+        done[name] = step
+        if report is not None:
+            report(sum(done.values()))
+
+    value = compare_decoders(options, (MeshMeasure(options.resolution),), progress)
+    rows = {name: _row(row) for name, row in value["decoders"].items()}
+    notes = [
+        f"{options.steps} steps of {options.points} points, seeds {list(options.seeds)}; IoU in "
+        f"per cent on {options.poses} unseen poses, meshes of {options.measured_poses} of them at "
+        f"resolution {options.resolution}; lengths in 1e-4 m, angles in degrees.",
+        str(value["note"]),
+    ]
+    if "control_hurts" in value:
+        hurts = "hurt" if value["control_hurts"] else "do not hurt: the table says nothing"
+        notes.append(f"Control: shuffled pairs {hurts}.")
+    return ResultTable("Geometry: decoders of the occupancy field", rows, tuple(notes))
+
+
+def _row(row: Mapping[str, Any]) -> dict[str, Cell]:
+    difference = row.get("minus_pair", {}).get("iou")
+    compared = None
+    if difference is not None:
+        mean, low, high = (100 * difference[key] for key in ("mean", "low", "high"))
+        compared = f"{mean:+.2f} [{low:+.2f}, {high:+.2f}]"
+    cells: dict[str, Cell] = {
+        "parameters": row["parameters"],
+        "IoU": round(100 * row["iou"], 2),
+        "in boxes": round(100 * row["iou_boxes"], 2),
+        "near surface": round(100 * row["iou_surface"], 2),
+        "IoU - pair [95 %]": compared,
+        "IoU per 100K": round(row["iou_points_per_100k"], 1),
+    }
+    for name in _MESH_COLUMNS:
+        cells[name] = round(row[name], 3) if math.isfinite(row[name]) else None
+    return cells
