@@ -16,13 +16,13 @@ from handavatar.geometry.meshes import is_inside
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import divide_into_parts
 from handavatar.hand.pose import NUM_BONES
+from handavatar.train.labelled_poses import labelled_pose
 from handavatar.train.prior import (
     SHIPPED_PRIOR,
     PriorEvaluationOptions,
     PriorOptions,
     evaluate_prior,
     intersection_over_union,
-    labelled_pose,
     load_prior,
     open_prior,
     train_prior,
@@ -30,7 +30,7 @@ from handavatar.train.prior import (
 
 
 def _options(out: Path) -> PriorOptions:
-    return PriorOptions(out, steps=4, points=128, pool=2, refresh=2, level="778", rounds=0)
+    return PriorOptions(out, steps=4, points=128, level="778", rounds=0)
 
 
 def test_training_repeats_with_its_seed_and_writes_what_it_returns(tmp_path: Path) -> None:
