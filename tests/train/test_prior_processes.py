@@ -6,7 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
-import time
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +14,14 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+import handavatar.train.prior as prior
 from handavatar.avatar import CheckpointError
+from handavatar.train.labelled_poses import PoseStream, TargetPose
+from handavatar.train.pretraining import begin_prior_run
 from handavatar.train.prior import PriorOptions, train_prior
+from handavatar.train.processes import Processes
+from handavatar.train.stage_times import StageTimes
+from handavatar.train.stopping import Interrupted
 
 WORDS = ["prior", "train", "--points", "64", "--level", "778", "--rounds", "0", "--poses", "2"]
 
@@ -80,32 +86,46 @@ def test_two_processes_learn_what_one_learns_stop_together_and_continue(tmp_path
     assert sum(shares) == pytest.approx(1)
 
 
-def test_processes_that_cannot_share_evenly_are_refused(tmp_path: Path) -> None:
-    codes, text = _ended(_two_begun([*WORDS[:-1], "3", "--out", str(tmp_path / "a")]))
-    assert all(codes) and "expected as many for each" in text
+def test_processes_that_cannot_share_evenly_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prior, "joined_processes", lambda _: nullcontext(Processes(0, 3, "cpu")))
+    with pytest.raises(ValueError, match="2 poses a step for 3 processes"):
+        train_prior(_options(tmp_path / "a", 1))
 
 
-def test_a_stopped_training_continues_bit_for_bit(tmp_path: Path) -> None:
-    steps = 40
-    words = [*WORDS, "--steps", str(steps), "--out", str(tmp_path / "b"), "--run"]
-    words.append(str(tmp_path / "run"))
-    process = _begun([*words, "--checkpoint-every", "1"])
-    checkpoints = tmp_path / "run" / "checkpoints"
-    deadline = time.monotonic() + 60
-    while not list(checkpoints.glob("step-*")) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGTERM)
-    (code,), text = _ended([process])
-    assert code != 0 and "continue with --run" in text, text
-    done = max(int(path.name[5:]) for path in checkpoints.glob("step-*"))
-    assert 0 < done < steps
-    whole = train_prior(_options(tmp_path / "a", steps)).state_dict()
-    options = replace(_options(tmp_path / "b", steps), run=tmp_path / "run")
+def test_a_stopped_training_continues_bit_for_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = replace(_options(tmp_path / "b", 5), run=tmp_path / "run", checkpoint_every=2)
+    whole = train_prior(replace(options, out=tmp_path / "a", run=None)).state_dict()
+    drawn = PoseStream.drawn
+
+    def interrupted(stream: PoseStream, number: int, times: StageTimes) -> TargetPose:
+        if number == 2 * 2:  # Amid step 3.
+            os.kill(os.getpid(), signal.SIGTERM)
+        return drawn(stream, number, times)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(PoseStream, "drawn", interrupted)
+        with pytest.raises(Interrupted, match="stopped at step 3; continue with --run"):
+            train_prior(options)
+    # As if it had been killed later, after a checkpoint that the disk lost.
+    (tmp_path / "run" / "log.jsonl").open("a").write(json.dumps({"step": 4}) + "\n")
     resumed = train_prior(options).state_dict()
     assert all(torch.equal(resumed[name], whole[name]) for name in whole)
+    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in log] == [3, 5]
+    saved = load_file(tmp_path / "b")
+    assert all(torch.equal(saved[name], whole[name]) for name in whole)
+
+
+def test_a_run_is_continued_with_its_own_options_alone(tmp_path: Path) -> None:
+    begin_prior_run(tmp_path / "run", {"lr": 1, "seed": 0})
+    begin_prior_run(tmp_path / "run", {"lr": 1, "seed": 0})
     with pytest.raises(CheckpointError, match="other options: lr, seed"):
-        train_prior(replace(options, seed=1, lr=1e-2))
+        begin_prior_run(tmp_path / "run", {"lr": 2, "seed": 1})
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "letter.txt").write_text("mine")
     with pytest.raises(CheckpointError, match="no pre-training run"):
-        train_prior(replace(options, run=tmp_path / "full"))
+        begin_prior_run(tmp_path / "full", {})
