@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 
 import handavatar.train.prior as prior
 from handavatar.avatar import CheckpointError
-from handavatar.train.labelled_poses import PoseStream, TargetPose
+from handavatar.train.labelled_poses import LabelledPose, PoseStream
 from handavatar.train.pretraining import begin_prior_run
 from handavatar.train.prior import PriorOptions, train_prior
 from handavatar.train.processes import Processes
@@ -101,7 +101,7 @@ def test_a_stopped_training_continues_bit_for_bit(
     whole = train_prior(replace(options, out=tmp_path / "a", run=None)).state_dict()
     drawn = PoseStream.drawn
 
-    def interrupted(stream: PoseStream, number: int, times: StageTimes) -> TargetPose:
+    def interrupted(stream: PoseStream, number: int, times: StageTimes) -> LabelledPose:
         if number == 2 * 2:  # Amid step 3.
             os.kill(os.getpid(), signal.SIGTERM)
         return drawn(stream, number, times)

@@ -14,7 +14,7 @@ from handavatar.field.decoders import OccupancyField
 from handavatar.field.occupancy import HandCodes, PairOccupancy
 from handavatar.hand.parts import Parts
 from handavatar.hand.rig import PosedHand
-from handavatar.train.labelled_poses import TargetPose
+from handavatar.train.labelled_poses import LabelledPose
 from handavatar.train.optimizer_state import (
     optimizer_options,
     optimizer_tensors,
@@ -31,13 +31,13 @@ from handavatar.train.runs import (
 from handavatar.train.stage_times import StageTimes
 
 LEAST_ERROR = 0.02
-"""Points that are this close to their target have hardly a gradient, and are left out of it."""
+"""A point whose occupancy is this close to its label has hardly a gradient, and is left out."""
 _WARM_UP = 0.02
 """Share of the steps in which the learning rate rises: Adam's moments must settle first."""
 
 
 class OccupancyLoss(nn.Module):
-    """Cross entropy between a field and the targets of some hands.
+    """Cross entropy between a field and the labels of some hands.
 
     A module, because DistributedDataParallel joins the gradients of modules' forward passes.
     """
@@ -56,7 +56,7 @@ class OccupancyLoss(nn.Module):
         self.parts = parts
         self.times = times
 
-    def forward(self, samples: Sequence[TargetPose]) -> Float[Tensor, ""]:
+    def forward(self, samples: Sequence[LabelledPose]) -> Float[Tensor, ""]:
         """Mean over all points of all hands.
 
         Source: paper Sec. 3.2, L_PairOF.
@@ -68,7 +68,7 @@ class OccupancyLoss(nn.Module):
             posed, points = _moved(sample.posed, loss.device), sample.points.to(loss.device)
             with self.times.stage("encode"):
                 codes = self.field.encode(self.parts, posed)
-            predicted, target = self._erring(codes, points, sample.occupancy.to(loss.device))
+            predicted, target = self._erring(codes, points, sample.is_inside.to(points))
             total = nn.functional.binary_cross_entropy(predicted, target, reduction="sum")
             loss = loss + total / (len(points) * len(samples))
         return loss

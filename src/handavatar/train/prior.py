@@ -45,8 +45,8 @@ SHIPPED_PRIOR = Path(__file__).parent.parent / "assets" / "prior.safetensors"
 """Made at commit 214103c with ``handavatar prior train --steps 9000 --out a.safetensors`` and then
 ``--start a.safetensors --steps 5000 --lr 6e-4 --final-lr 3e-5 --warm-up 0 --seed 1 --refresh 2``;
 the first run was made before the cut at the wrist was sampled. Since then poses come from an
-endless stream instead of a pool, points lie nearer to the surface, targets are graded and the loss
-is cross entropy, so that these words are no longer understood: check that commit out for them."""
+endless stream instead of a pool, points lie nearer to the surface and the loss is cross entropy,
+so that these words are no longer understood: check that commit out for them."""
 EVALUATION_SEED = 1_000_003
 """Evaluation poses come from seeds that training never draws."""
 
@@ -102,7 +102,7 @@ def train_prior(
         options: see :class:`PriorOptions`.
         report: called now and then with the step and the current figures: ``loss``,
             ``samples_per_second`` (labelled points, of all processes together), and the share of
-            each stage of the first process's time since the last report, as ``share_...``.
+            each stage of the first process's time, as ``share_...``; since the start of this call.
 
     Raises:
         CheckpointError: if ``run`` holds something else than a run with these options.
@@ -155,8 +155,6 @@ def _trained(
         loss_of = DistributedDataParallel(loss_of, broadcast_buffers=False)
     if run is not None and run.log.exists():
         truncate_log(run, done)
-    reported = done
-    times.restart()
     for step in range(done + 1, options.steps + 1):
         first = (step - 1) * options.poses + processes.rank
         own = range(first, step * options.poses, processes.count)
@@ -176,15 +174,13 @@ def _trained(
             is_stopped = processes.any(stopped())
         is_last = step == options.steps or is_stopped
         if processes.is_first and (step % 100 == 0 or is_last):
-            points = (step - reported) * options.poses * options.points
+            points = (step - done) * options.poses * options.points
             figures = {"loss": average, "samples_per_second": points / times.seconds}
             figures |= {f"share_{name}": share for name, share in times.shares().items()}
             if report is not None:
                 report(step, figures)
             if run is not None:
                 append_log(run, step, figures)
-            reported = step
-            times.restart()
         if processes.is_first and (step % options.checkpoint_every == 0 or is_last):
             save_prior(field, options, step)
             if run is not None:

@@ -33,7 +33,7 @@ class StageTimes:
 
     @property
     def seconds(self) -> float:
-        """Since the beginning or the last restart."""
+        """Since the beginning."""
         return self._clock() - self._begin
 
     def shares(self) -> dict[str, float]:
@@ -41,8 +41,3 @@ class StageTimes:
         total = max(self.seconds, 1e-9)
         shares = {name: seconds / total for name, seconds in self._seconds.items()}
         return {**shares, "other": max(1.0 - sum(shares.values()), 0.0)}
-
-    def restart(self) -> None:
-        """Forgets everything."""
-        self._begin = self._clock()
-        self._seconds.clear()
