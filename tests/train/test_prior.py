@@ -58,10 +58,10 @@ def test_training_repeats_with_its_seed_and_writes_what_it_returns(tmp_path: Pat
 
 def test_training_continues_from_a_prior(tmp_path: Path) -> None:
     options = replace(
-        _options(tmp_path / "on"), steps=1, lr=1e-9, final_lr=1e-9, start=SHIPPED_PRIOR
+        _options(tmp_path / "on"), steps=1, lr=1e-9, final_lr=1e-9, start_from=SHIPPED_PRIOR
     )
     field, shipped = train_prior(options), load_file(SHIPPED_PRIOR)
-    # One step of Adam moves every weight by at most the learning rate.
+    # One step moves every weight by about the learning rate at most.
     for name, value in field.state_dict().items():
         torch.testing.assert_close(value, shipped[name], atol=1e-7, rtol=0)
 

@@ -69,7 +69,7 @@ def _ended(processes: list[subprocess.Popen[str]]) -> tuple[list[int], str]:
 
 def test_two_processes_learn_what_one_learns_stop_together_and_continue(tmp_path: Path) -> None:
     one = load_file(tmp_path / "one") if train_prior(_options(tmp_path / "one", 3)) else {}
-    words = [*WORDS, "--out", str(tmp_path / "two"), "--run", str(tmp_path / "run")]
+    words = [*WORDS, "--out", str(tmp_path / "two"), "--folder", str(tmp_path / "run")]
     codes, text = _ended(_two_begun([*words, "--steps", "3"]))
     assert codes == [0, 0], text
     two = load_file(tmp_path / "two")
@@ -97,8 +97,8 @@ def test_processes_that_cannot_share_evenly_are_refused(
 def test_a_stopped_training_continues_bit_for_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    options = replace(_options(tmp_path / "b", 5), run=tmp_path / "run", checkpoint_every=2)
-    whole = train_prior(replace(options, out=tmp_path / "a", run=None)).state_dict()
+    options = replace(_options(tmp_path / "b", 5), folder=tmp_path / "run", checkpoint_every=2)
+    whole = train_prior(replace(options, out=tmp_path / "a", folder=None)).state_dict()
     drawn = PoseStream.drawn
 
     def interrupted(stream: PoseStream, number: int, times: StageTimes) -> LabelledPose:
@@ -108,7 +108,7 @@ def test_a_stopped_training_continues_bit_for_bit(
 
     with monkeypatch.context() as patched:
         patched.setattr(PoseStream, "drawn", interrupted)
-        with pytest.raises(Interrupted, match="stopped at step 3; continue with --run"):
+        with pytest.raises(Interrupted, match="stopped at step 3; continue with --folder"):
             train_prior(options)
     # As if it had been killed later, after a checkpoint that the disk lost.
     (tmp_path / "run" / "log.jsonl").open("a").write(json.dumps({"step": 4}) + "\n")

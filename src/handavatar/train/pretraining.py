@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -33,7 +33,11 @@ from handavatar.train.stage_times import StageTimes
 LEAST_ERROR = 0.02
 """A point whose occupancy is this close to its label has hardly a gradient, and is left out."""
 _WARM_UP = 0.02
-"""Share of the steps in which the learning rate rises: Adam's moments must settle first."""
+"""Share of the steps in which the learning rate rises: the moments must settle first."""
+_VECTOR_RATE = 0.6
+"""Learning rate of biases and narrow matrices, as a part of that of the others."""
+_NARROW = 8
+"""Matrices with so few rows or columns are no better than vectors for Muon."""
 
 
 class OccupancyLoss(nn.Module):
@@ -91,6 +95,29 @@ class OccupancyLoss(nn.Module):
             return self.field.of_items(codes, points[is_erring], items), target[is_erring]
 
 
+def prior_optimizers(field: OccupancyField) -> dict[str, torch.optim.Optimizer]:
+    """Muon for the matrices, Adam for all else; no rate is set yet.
+
+    Departs: the authors use Adam alone, with which the same time on a CPU gains half as much.
+    """
+    parameters = list(field.parameters())
+    is_wide = [p.ndim == 2 and min(p.shape) > _NARROW for p in parameters]
+    wide = [p for p, chosen in zip(parameters, is_wide, strict=True) if chosen]
+    narrow = [p for p, chosen in zip(parameters, is_wide, strict=True) if not chosen]
+    return {
+        # Steps as long as Adam's, so that one learning rate does for both.
+        "muon": torch.optim.Muon(wide, weight_decay=0.0, adjust_lr_fn="match_rms_adamw"),
+        "adam": torch.optim.Adam(narrow),
+    }
+
+
+def set_rate(optimizers: Mapping[str, torch.optim.Optimizer], rate: float) -> None:
+    """The learning rate of the next step, Muon's; Adam's follows."""
+    for name, optimizer in optimizers.items():
+        for group in optimizer.param_groups:
+            group["lr"] = rate if name == "muon" else _VECTOR_RATE * rate
+
+
 def learning_rate(step: int, steps: int, highest: float, lowest: float) -> float:
     """Of a step, counted from 1: a short rise, then half a cosine down to the lowest."""
     rise = min(1.0, step / max(_WARM_UP * steps, 1))
@@ -116,13 +143,13 @@ def begin_prior_run(folder: Path, options: Json) -> Run:
         if different:
             raise CheckpointError(
                 f"{folder}: the run there was begun with other options: {', '.join(different)}\n"
-                "give the same ones to continue it, or name another folder with --run"
+                "give the same ones to continue it, or name another folder with --folder"
             )
         return run
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise CheckpointError(
             f"{folder}: holds something that is no pre-training run, expected a new folder\n"
-            "name another with --run"
+            "name another with --folder"
         )
     run.checkpoints.mkdir(parents=True)
     write_json(path, options)
@@ -130,17 +157,23 @@ def begin_prior_run(folder: Path, options: Json) -> Run:
 
 
 def save_progress(
-    run: Run, step: int, field: OccupancyField, optimizer: torch.optim.Optimizer, average: float
+    run: Run,
+    step: int,
+    field: OccupancyField,
+    optimizers: Mapping[str, torch.optim.Optimizer],
+    average: float,
 ) -> None:
     """Writes everything that :func:`load_progress` needs to go on bit for bit."""
-    tensors = {"model": field.state_dict(), "optimizer": optimizer_tensors(optimizer)}
-    save_checkpoint(run, step, tensors, {**optimizer_options(optimizer), "average": average})
+    tensors = {"model": field.state_dict()}
+    tensors |= {name: optimizer_tensors(optimizer) for name, optimizer in optimizers.items()}
+    state: Json = {name: optimizer_options(optimizer) for name, optimizer in optimizers.items()}
+    save_checkpoint(run, step, tensors, {**state, "average": average})
 
 
 def load_progress(
-    run: Run, field: OccupancyField, optimizer: torch.optim.Optimizer
+    run: Run, field: OccupancyField, optimizers: Mapping[str, torch.optim.Optimizer]
 ) -> tuple[int, float]:
-    """Sets field and optimiser to the newest whole checkpoint.
+    """Sets field and optimisers to the newest whole checkpoint.
 
     Returns:
         The steps done (0 if there is no checkpoint), and the running average of the loss.
@@ -150,7 +183,8 @@ def load_progress(
         return 0, math.nan
     contents = load_checkpoint(checkpoint)
     field.load_state_dict(contents.tensors["model"])
-    restore_optimizer(optimizer, contents.tensors["optimizer"], contents.state)
+    for name, optimizer in optimizers.items():
+        restore_optimizer(optimizer, contents.tensors[name], contents.state[name])
     return checkpoint.step, float(contents.state["average"])
 
 

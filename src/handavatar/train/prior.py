@@ -4,7 +4,8 @@ No data set: poses come from the sampler of plausible poses, shapes from the rig
 labels from the generalised winding number of the sealed mesh (an overlap of fingers is inside).
 Nothing depends on the wrist's placement: the field works in the frames of the bones.
 
-Several processes: ``torchrun --nproc-per-node 2 -m handavatar prior train --poses 2 ...``.
+Several processes: ``torchrun --nproc-per-node 2 -m handavatar prior train --poses 2 ...``. Torchrun
+takes any abbreviation of its own options for itself: no option here may begin one of them.
 """
 
 import json
@@ -34,7 +35,9 @@ from handavatar.train.pretraining import (
     begin_prior_run,
     learning_rate,
     load_progress,
+    prior_optimizers,
     save_progress,
+    set_rate,
 )
 from handavatar.train.processes import Processes, joined_processes
 from handavatar.train.runs import Run, append_log, locked, truncate_log
@@ -65,11 +68,11 @@ class PriorOptions:
         level: which open hand.
         rounds: midpoint subdivisions of the mesh that is encoded and labelled.
         seed: of everything.
-        start: a prior to continue from.
+        start_from: a prior to continue from.
         decoder: ``pair`` is PairOF, the avatar's. Only for comparison with it: ``pair-shuffled``
             pairs parts that do not touch, ``coap`` and ``coap-wide`` decode each part alone,
             ``transformer`` all parts together.
-        run: folder for the log and checkpoints; what was begun there is continued.
+        folder: for the log and checkpoints; what was begun there is continued.
         checkpoint_every: steps between two writings.
         device: where the networks run.
     """
@@ -83,9 +86,9 @@ class PriorOptions:
     level: Level = "full"
     rounds: int = 1
     seed: int = 0
-    start: Path | None = None
+    start_from: Path | None = None
     decoder: Decoder = "pair"
-    run: Path | None = None
+    folder: Path | None = None
     checkpoint_every: int = 1000
     device: str = "cpu"
 
@@ -105,8 +108,8 @@ def train_prior(
             each stage of the first process's time, as ``share_...``; since the start of this call.
 
     Raises:
-        CheckpointError: if ``run`` holds something else than a run with these options.
-        Interrupted: after SIGINT or SIGTERM; a checkpoint was saved if there is a ``run``.
+        CheckpointError: if ``folder`` holds something else than a run with these options.
+        Interrupted: after SIGINT or SIGTERM; a checkpoint was saved if there is a ``folder``.
         ValueError: if the processes cannot share the poses of a step evenly.
     """
     with joined_processes(options.device) as processes, stop_signals() as stopped:
@@ -117,8 +120,8 @@ def train_prior(
             )
         with ExitStack() as held:
             run = None
-            if options.run is not None and processes.is_first:
-                run = begin_prior_run(options.run, _what_to_learn(options))
+            if options.folder is not None and processes.is_first:
+                run = begin_prior_run(options.folder, _what_to_learn(options))
                 held.enter_context(locked(run))
             return _trained(options, processes, run, stopped, report)
 
@@ -133,18 +136,18 @@ def _trained(
     """The loop; ``run`` is the first process's alone."""
     torch.manual_seed(options.seed)
     field = untrained_field(options.decoder)
-    if options.start is not None:
-        load_prior(field, options.start, options.decoder)
+    if options.start_from is not None:
+        load_prior(field, options.start_from, options.decoder)
     field.to(processes.device)
-    optimizer = torch.optim.Adam(field.parameters(), lr=options.lr)
+    optimizers = prior_optimizers(field)
     done, average = 0, math.nan
-    if options.run is not None:
+    if options.folder is not None:
         # The first process may put a broken checkpoint aside; the others must not be quicker.
         if processes.is_first:
-            done, average = load_progress(Run(options.run), field, optimizer)
+            done, average = load_progress(Run(options.folder), field, optimizers)
         processes.wait()
         if not processes.is_first:
-            done, average = load_progress(Run(options.run), field, optimizer)
+            done, average = load_progress(Run(options.folder), field, optimizers)
     base = load_open_hand(options.level)
     rig = subdivided(base, options.rounds)
     parts = divide_into_parts(rig)
@@ -159,15 +162,15 @@ def _trained(
         first = (step - 1) * options.poses + processes.rank
         own = range(first, step * options.poses, processes.count)
         samples = [stream.drawn(number, times) for number in own]
-        for group in optimizer.param_groups:
-            group["lr"] = learning_rate(step, options.steps, options.lr, options.final_lr)
-        optimizer.zero_grad()
+        set_rate(optimizers, learning_rate(step, options.steps, options.lr, options.final_lr))
+        field.zero_grad()
         loss = loss_of(samples)
         with times.stage("backward"):
             loss.backward()
         with times.stage("optimizer"):
             torch.nn.utils.clip_grad_norm_(field.parameters(), 1.0)
-            optimizer.step()
+            for optimizer in optimizers.values():
+                optimizer.step()
         value = float(loss.detach())
         average = value if math.isnan(average) else 0.99 * average + 0.01 * value
         with times.stage("wait"):
@@ -184,18 +187,22 @@ def _trained(
         if processes.is_first and (step % options.checkpoint_every == 0 or is_last):
             save_prior(field, options, step)
             if run is not None:
-                save_progress(run, step, field, optimizer, average)
+                save_progress(run, step, field, optimizers, average)
         if is_stopped and step < options.steps:
-            way = f"continue with --run {options.run}" if options.run else f"so far: {options.out}"
+            way = (
+                f"continue with --folder {options.folder}"
+                if options.folder
+                else f"so far: {options.out}"
+            )
             raise Interrupted(f"stopped at step {step}; {way}")
     return field
 
 
 def _what_to_learn(options: PriorOptions) -> dict[str, Any]:
     """The options on which the weights depend, as JSON."""
-    elsewhere = ("out", "run", "checkpoint_every", "device")
+    elsewhere = ("out", "folder", "checkpoint_every", "device")
     record = {name: value for name, value in asdict(options).items() if name not in elsewhere}
-    return {**record, "start": None if options.start is None else str(options.start)}
+    return {**record, "start_from": None if options.start_from is None else str(options.start_from)}
 
 
 def save_prior(field: OccupancyField, options: PriorOptions, step: int) -> None:
