@@ -7,7 +7,7 @@ import socket
 import subprocess
 import sys
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import pytest
@@ -129,3 +129,13 @@ def test_a_run_is_continued_with_its_own_options_alone(tmp_path: Path) -> None:
     (tmp_path / "full" / "letter.txt").write_text("mine")
     with pytest.raises(CheckpointError, match="no pre-training run"):
         begin_prior_run(tmp_path / "full", {})
+
+
+def test_torchrun_leaves_our_options_alone() -> None:
+    """It reads the words behind the program's name too, and knows its own by their beginnings."""
+    from torch.distributed.run import get_args_parser
+
+    for field in fields(PriorOptions):
+        word = "--" + field.name.replace("_", "-")
+        parsed = get_args_parser().parse_args(["-m", "handavatar", "prior", "train", word, "1"])
+        assert parsed.training_script_args == ["prior", "train", word, "1"]
