@@ -26,7 +26,6 @@ def _options(out: Path) -> ComparisonOptions:
         out,
         steps=1,
         points=64,
-        pool=1,
         poses=3,
         judged_points=256,
         measured_poses=2,
@@ -111,20 +110,21 @@ def test_every_decoder_sees_the_same_points(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What reaches the inside test, training by training."""
+    import handavatar.train.labelled_poses as labelled_poses
     import handavatar.train.prior as prior
 
     seen: list[list[torch.Tensor]] = []
-    original = prior.sample_points
+    original = labelled_poses.training_points
 
     def watched(*arguments: Any) -> torch.Tensor:
         seen[-1].append(original(*arguments))
         return seen[-1][-1]
 
-    monkeypatch.setattr(prior, "sample_points", watched)
+    monkeypatch.setattr(labelled_poses, "training_points", watched)
     for decoder in get_args(Decoder):
         seen.append([])
         options = prior.PriorOptions(
-            tmp_path / decoder, steps=1, points=32, pool=1, level="778", rounds=0, decoder=decoder
+            tmp_path / decoder, steps=1, points=32, level="778", rounds=0, decoder=decoder
         )
         prior.train_prior(options)
     for points in seen[1:]:
@@ -156,7 +156,6 @@ def test_the_table_has_a_row_per_decoder_and_says_what_it_rests_on(tmp_path: Pat
         decoders=("pair", "coap"),
         steps=2,
         points=64,
-        pool=1,
         poses=2,
         judged_points=256,
         measured_poses=2,

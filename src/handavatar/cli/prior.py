@@ -5,12 +5,27 @@ def train(words: list[str]) -> int:
     """Pre-train the occupancy prior on sampled poses and shapes."""
     from handavatar.cli.arguments import parse
     from handavatar.train.prior import PriorOptions, train_prior
+    from handavatar.train.processes import is_first_process
     from handavatar.train.progress import Progress
 
     options = parse(PriorOptions, words, "prior train")
+    if not is_first_process():
+        train_prior(options)
+        return 0
+    latest: dict[str, float] = {}
     with Progress("prior", options.steps) as progress:
-        train_prior(options, lambda step, figures: progress.update(step, **figures))
-    print(f"prior: {options.out}\nnext: handavatar prior evaluate --prior {options.out}")
+
+        def report(step: int, figures: dict[str, float]) -> None:
+            latest.update(figures)
+            progress.update(step, loss=figures["loss"], samples=figures["samples_per_second"])
+
+        train_prior(options, report)
+    print(f"prior: {options.out}")
+    if latest:
+        shares = [(share, name[6:]) for name, share in latest.items() if name.startswith("share_")]
+        listed = ", ".join(f"{name} {share:.0%}" for share, name in sorted(shares, reverse=True))
+        print(f"speed: {latest['samples_per_second']:,.0f} labelled points/s; {listed}")
+    print(f"next: handavatar prior evaluate --prior {options.out}")
     return 0
 
 

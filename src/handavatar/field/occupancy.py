@@ -52,6 +52,14 @@ class PairItems:
     pairs: Int[Tensor, "items"]
     is_wanted: Bool[Tensor, "items 2"]
 
+    def among(self, chosen: Bool[Tensor, "points"]) -> "PairItems":
+        """The items of the chosen points, which are numbered anew in their order."""
+        is_kept = chosen[self.points]
+        numbers = chosen.cumsum(0) - 1
+        return PairItems(
+            numbers[self.points[is_kept]], self.pairs[is_kept], self.is_wanted[is_kept]
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Occupancy:

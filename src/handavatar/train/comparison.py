@@ -25,8 +25,8 @@ from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
 from handavatar.train.attention import attention_figures, attention_picture, read_attention
+from handavatar.train.labelled_poses import LabelledPose
 from handavatar.train.prior import (
-    LabelledPose,
     PriorEvaluationOptions,
     PriorOptions,
     evaluation_poses,
@@ -50,7 +50,6 @@ class ComparisonOptions:
         seeds: each one trains every decoder once, all on the same data.
         steps: optimisation steps of each training.
         points: labelled points per step.
-        pool: labelled poses kept at hand.
         poses: unseen poses of unseen shapes that judge, two or more.
         judged_points: labelled points of each of them, half in boxes, half near the surface.
         measured_poses: how many of the poses are also given to the measures.
@@ -64,7 +63,6 @@ class ComparisonOptions:
     seeds: tuple[int, ...] = (0,)
     steps: int = 10_000
     points: int = 1024
-    pool: int = 192
     poses: int = 50
     judged_points: int = 4096
     measured_poses: int = 10
@@ -205,7 +203,6 @@ def _train(
             out=options.priors / f"{name}.safetensors",
             steps=options.steps,
             points=options.points,
-            pool=options.pool,
             level=options.level,
             rounds=options.rounds,
             seed=seed,

@@ -14,7 +14,8 @@ from handavatar.field.occupancy import HandCodes
 from handavatar.hand.parts import divide_into_parts
 from handavatar.hand.rig import PosedHand
 from handavatar.train.comparison import ComparisonOptions, compare_decoders
-from handavatar.train.prior import EVALUATION_SEED, sample_points
+from handavatar.train.labelled_poses import sample_points
+from handavatar.train.prior import EVALUATION_SEED
 from handavatar.train.prior_measures import measure_field
 
 _MESH_COLUMNS = ("lap", "cham_from_truth", "cham", "seam", "seam_step")

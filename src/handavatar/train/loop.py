@@ -1,10 +1,6 @@
 """The training loop: capture in, avatar out. There is only this one."""
 
 import math
-import signal
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +20,7 @@ from handavatar.geometry.meshes import is_inside
 from handavatar.hand.rigs import find_rig
 from handavatar.train.appearance import SeenSamples, appearance_loss, find_seen_samples
 from handavatar.train.corrections import PoseCorrections
+from handavatar.train.labelled_poses import sample_points
 from handavatar.train.losses import color_loss, occupancy_loss
 from handavatar.train.optimizer_state import (
     optimizer_options,
@@ -31,7 +28,7 @@ from handavatar.train.optimizer_state import (
     restore_optimizer,
 )
 from handavatar.train.outlines import EdgeSet, corrected_pose, fit_outlines, shape_losses
-from handavatar.train.prior import SHIPPED_PRIOR, load_prior, sample_points
+from handavatar.train.prior import SHIPPED_PRIOR, load_prior
 from handavatar.train.progress import Progress
 from handavatar.train.runs import (
     Checkpoint,
@@ -47,6 +44,7 @@ from handavatar.train.runs import (
     save_checkpoint,
     truncate_log,
 )
+from handavatar.train.stopping import Interrupted, stop_signals
 
 
 @dataclass(frozen=True)
@@ -184,10 +182,6 @@ class Training:
     optimizer: torch.optim.Optimizer
 
 
-class Interrupted(KeyboardInterrupt):
-    """Training was told to stop and has saved a checkpoint."""
-
-
 def train(options: TrainOptions) -> Path:
     """Trains an avatar and returns the run folder.
 
@@ -216,7 +210,7 @@ def train(options: TrainOptions) -> Path:
     training = begin_training(capture, frames, method, options)
     training.avatar.info["view"] = view_of(frames)
     run = _open_or_create(options, capture, perceptual.name, steps)
-    with locked(run), _stop_signals() as stopped:
+    with locked(run), stop_signals() as stopped:
         checkpoint = latest_checkpoint(run)
         outlines = _fit_or_restore_outlines(run, checkpoint, training, frames, method, options)
         # Before the checkpoint is loaded: the samples are those of the geometry as it is now.
@@ -594,25 +588,3 @@ def _restore(run: Run, checkpoint: Checkpoint | None, training: Training) -> int
 
 def _named(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {name[len(prefix) :]: v for name, v in tensors.items() if name.startswith(prefix)}
-
-
-@contextmanager
-def _stop_signals() -> Iterator[Any]:
-    """Turns the first SIGINT or SIGTERM into a wish to stop; the second one kills."""
-    received: list[int] = []
-    watched = (signal.SIGINT, signal.SIGTERM)
-
-    def note(number: int, _: Any) -> None:
-        received.append(number)
-        for watched_number, handler in zip(watched, before, strict=True):
-            signal.signal(watched_number, handler)
-
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False  # Signals are the caller's business.
-        return
-    before = [signal.signal(number, note) for number in watched]
-    try:
-        yield lambda: bool(received)
-    finally:
-        for number, handler in zip(watched, before, strict=True):
-            signal.signal(number, handler)

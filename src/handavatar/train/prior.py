@@ -3,37 +3,54 @@
 No data set: poses come from the sampler of plausible poses, shapes from the rig's shape space,
 labels from the generalised winding number of the sealed mesh (an overlap of fingers is inside).
 Nothing depends on the wrist's placement: the field works in the frames of the bones.
+
+Several processes: ``torchrun --nproc-per-node 2 -m handavatar prior train --poses 2 ...``. Torchrun
+takes any abbreviation of its own options for itself: no option here may begin one of them.
 """
 
 import json
 import math
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 
 from handavatar.avatar import CheckpointError
 from handavatar.evaluate.geometry import intersection_over_union
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
-from handavatar.geometry.meshes import is_inside, sample_surface
-from handavatar.geometry.rotations import apply_rigid
 from handavatar.hand.detail import subdivided
 from handavatar.hand.open_hand import Level, load_open_hand
 from handavatar.hand.parts import Parts, divide_into_parts
-from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
-from handavatar.hand.rig import PosedHand, Rig
+from handavatar.train.labelled_poses import LabelledPose, PoseStream, labelled_pose
+from handavatar.train.pretraining import (
+    OccupancyLoss,
+    begin_prior_run,
+    learning_rate,
+    load_progress,
+    prior_optimizers,
+    save_progress,
+    set_rate,
+)
+from handavatar.train.processes import Processes, joined_processes
+from handavatar.train.runs import Run, append_log, locked, truncate_log
+from handavatar.train.stage_times import StageTimes
+from handavatar.train.stopping import Interrupted, stop_signals
 
 SHIPPED_PRIOR = Path(__file__).parent.parent / "assets" / "prior.safetensors"
-"""Made with ``handavatar prior train --steps 9000 --out a.safetensors`` and then ``--start
-a.safetensors --steps 5000 --lr 6e-4 --final-lr 3e-5 --warm-up 0 --seed 1 --refresh 2``; the first
-run was made before the cut at the wrist was sampled."""
+"""Made at commit 214103c with ``handavatar prior train --steps 9000 --out a.safetensors`` and then
+``--start a.safetensors --steps 5000 --lr 6e-4 --final-lr 3e-5 --warm-up 0 --seed 1 --refresh 2``;
+the first run was made before the cut at the wrist was sampled. Since then poses come from an
+endless stream instead of a pool, points lie nearer to the surface and the loss is cross entropy,
+so that these words are no longer understood: check that commit out for them."""
 EVALUATION_SEED = 1_000_003
 """Evaluation poses come from seeds that training never draws."""
 
@@ -45,20 +62,19 @@ class PriorOptions:
     Attributes:
         out: where the trained prior is written (safetensors).
         steps: optimisation steps.
-        poses: poses per step.
-        points: labelled points per pose and step.
-        pool: labelled poses kept at hand.
-        refresh: a fresh pose replaces the oldest one every so many steps.
-        lr: learning rate at the start.
-        final_lr: learning rate at the end; exponential in between.
-        warm_up: share of the steps with cross entropy, before the paper's squared error alone.
+        poses: poses per step, all of them new; processes share them.
+        points: labelled points per pose.
+        lr: the highest learning rate, soon after the start.
+        final_lr: learning rate at the end; half a cosine in between.
         level: which open hand.
         rounds: midpoint subdivisions of the mesh that is encoded and labelled.
         seed: of everything.
-        start: a prior to continue from.
+        start_from: a prior to continue from.
         decoder: ``pair`` is PairOF, the avatar's. Only for comparison with it: ``pair-shuffled``
             pairs parts that do not touch, ``coap`` and ``coap-wide`` decode each part alone,
             ``transformer`` all parts together.
+        folder: for the log and checkpoints; what was begun there is continued.
+        checkpoint_every: steps between two writings.
         device: where the networks run.
     """
 
@@ -66,65 +82,16 @@ class PriorOptions:
     steps: int = 10_000
     poses: int = 1
     points: int = 1024
-    pool: int = 192
-    refresh: int = 3
     lr: float = 1e-3
     final_lr: float = 5e-5
-    warm_up: float = 0.5
     level: Level = "full"
     rounds: int = 1
     seed: int = 0
-    start: Path | None = None
+    start_from: Path | None = None
     decoder: Decoder = "pair"
+    folder: Path | None = None
+    checkpoint_every: int = 1000
     device: str = "cpu"
-
-
-@dataclass(frozen=True, eq=False)
-class LabelledPose:
-    """A posed hand with points whose inside or outside is known."""
-
-    posed: PosedHand
-    points: Float[Tensor, "points 3"]
-    is_inside: Bool[Tensor, "points"]
-
-
-def sample_points(
-    parts: Parts, posed: PosedHand, count: int, margin: float, generator: torch.Generator
-) -> Float[Tensor, "points 3"]:
-    """Half the points uniform in the part boxes, half near the surface (sigma 1 and 4 mm).
-
-    Without gradient and on the CPU. The surface is the sealed one: the cut at the wrist must be
-    learned like the rest.
-
-    Source: paper Sec. 3.2 (pre-training), after COAP: box and surface samples.
-    """
-    num_uniform = count // 2
-    boxes = parts.boxes(posed, margin)
-    bone = torch.arange(num_uniform) % NUM_BONES
-    lower, upper = boxes.lower.cpu()[bone] - margin, boxes.upper.cpu()[bone] + margin
-    local = lower + (upper - lower) * torch.rand(num_uniform, 3, generator=generator)
-    uniform = apply_rigid(posed.world_from_bone.detach().cpu()[bone], local[:, None])[:, 0]
-    num_near = count - num_uniform
-    sealed = posed.sealed_vertices.detach().cpu()
-    surface = sample_surface(sealed, posed.rig.sealed_faces.cpu(), num_near, generator)
-    sigma = torch.where(torch.arange(num_near) % 2 == 0, 0.001, 0.004)[:, None]
-    near = surface.positions(sealed)
-    return torch.cat([uniform, near + sigma * torch.randn(num_near, 3, generator=generator)])
-
-
-def labelled_pose(
-    rig: Rig,
-    parts: Parts,
-    rotations: Float[Tensor, "bones 3"],
-    count: int,
-    margin: float,
-    generator: torch.Generator,
-) -> LabelledPose:
-    """A hand of random shape in the given pose, with labelled points."""
-    coefficients = torch.randn(rig.shape_directions.shape[-1], generator=generator)
-    posed = rig.shaped(coefficients).posed(HandPose(rotations, torch.zeros(3)))
-    points = sample_points(parts, posed, count, margin, generator)
-    return LabelledPose(posed, points, is_inside(posed.sealed_vertices, rig.sealed_faces, points))
 
 
 def train_prior(
@@ -132,76 +99,117 @@ def train_prior(
 ) -> OccupancyField:
     """Pre-trains the occupancy field and writes it.
 
+    Started by ``torchrun``, the processes share the poses of every step and keep equal weights;
+    the first one writes. The result is that of one process but for rounding.
+
     Args:
         options: see :class:`PriorOptions`.
-        report: called now and then with the step and the current figures.
+        report: called now and then with the step and the current figures: ``loss``,
+            ``samples_per_second`` (labelled points, of all processes together), and the share of
+            each stage of the first process's time, as ``share_...``; since the start of this call.
 
-    Source: paper Sec. 3.2, L_PairOF: mean squared error of the occupancy.
-    Departs: cross entropy for the first ``warm_up`` of the steps, since the squared error of a
-        saturated sigmoid has hardly a gradient.
+    Raises:
+        CheckpointError: if ``folder`` holds something else than a run with these options.
+        Interrupted: after SIGINT or SIGTERM; a checkpoint was saved if there is a ``folder``.
+        ValueError: if the processes cannot share the poses of a step evenly.
     """
+    with joined_processes(options.device) as processes, stop_signals() as stopped:
+        if options.poses % processes.count:
+            raise ValueError(
+                f"prior: found {options.poses} poses a step for {processes.count} processes, "
+                "expected as many for each; give a multiple with --poses"
+            )
+        with ExitStack() as held:
+            run = None
+            if options.folder is not None and processes.is_first:
+                run = begin_prior_run(options.folder, _what_to_learn(options))
+                held.enter_context(locked(run))
+            return _trained(options, processes, run, stopped, report)
+
+
+def _trained(
+    options: PriorOptions,
+    processes: Processes,
+    run: Run | None,
+    stopped: Callable[[], bool],
+    report: Callable[[int, dict[str, float]], None] | None,
+) -> OccupancyField:
+    """The loop; ``run`` is the first process's alone."""
+    torch.manual_seed(options.seed)
+    field = untrained_field(options.decoder)
+    if options.start_from is not None:
+        load_prior(field, options.start_from, options.decoder)
+    field.to(processes.device)
+    optimizers = prior_optimizers(field)
+    done, average = 0, math.nan
+    if options.folder is not None:
+        # The first process may put a broken checkpoint aside; the others must not be quicker.
+        if processes.is_first:
+            done, average = load_progress(Run(options.folder), field, optimizers)
+        processes.wait()
+        if not processes.is_first:
+            done, average = load_progress(Run(options.folder), field, optimizers)
     base = load_open_hand(options.level)
     rig = subdivided(base, options.rounds)
     parts = divide_into_parts(rig)
-    torch.manual_seed(options.seed)
-    field = untrained_field(options.decoder)
-    if options.start is not None:
-        load_prior(field, options.start, options.decoder)
-    field.to(options.device)
-    parts_there = parts.to(options.device)
-    generator = torch.Generator().manual_seed(options.seed)
-    optimizer = torch.optim.Adam(field.parameters(), lr=options.lr)
-    decay = (options.final_lr / options.lr) ** (1 / max(options.steps, 1))
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimizer, decay)
-
-    def fresh() -> LabelledPose:
-        rotations = sample_poses(base, 1, generator)[0]
-        return labelled_pose(rig, parts, rotations, 4096, field.margin, generator)
-
-    pool = [fresh() for _ in range(min(options.pool, 16))]
-    average = math.nan
-    for step in range(1, options.steps + 1):
-        if step % options.refresh == 0:
-            pool = [*pool[1 - options.pool :], fresh()] if options.pool > 1 else [fresh()]
-        loss = torch.zeros((), device=options.device)
-        for index in torch.randint(len(pool), (options.poses,), generator=generator).tolist():
-            sample = pool[index]
-            chosen = torch.randint(len(sample.points), (options.points,), generator=generator)
-            points = sample.points[chosen].to(options.device)
-            target = sample.is_inside[chosen].to(points)
-            codes = field.encode(parts_there, _moved(sample.posed, options.device))
-            predicted = field.trainable_whole(codes, points)
-            if step <= options.warm_up * options.steps:
-                term = torch.nn.functional.binary_cross_entropy(predicted, target)
-            else:
-                term = (predicted - target).square().mean()
-            loss = loss + term / options.poses
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(field.parameters(), 1.0)
-        optimizer.step()
-        schedule.step()
+    stream = PoseStream(base, rig, parts, field.margin, options.points, options.seed)
+    times = StageTimes()
+    loss_of: nn.Module = OccupancyLoss(field, parts.to(processes.device), times)
+    if processes.count > 1:
+        loss_of = DistributedDataParallel(loss_of, broadcast_buffers=False)
+    if run is not None and run.log.exists():
+        truncate_log(run, done)
+    for step in range(done + 1, options.steps + 1):
+        first = (step - 1) * options.poses + processes.rank
+        own = range(first, step * options.poses, processes.count)
+        samples = [stream.drawn(number, times) for number in own]
+        set_rate(optimizers, learning_rate(step, options.steps, options.lr, options.final_lr))
+        field.zero_grad()
+        loss = loss_of(samples)
+        with times.stage("backward"):
+            loss.backward()
+        with times.stage("optimizer"):
+            torch.nn.utils.clip_grad_norm_(field.parameters(), 1.0)
+            for optimizer in optimizers.values():
+                optimizer.step()
         value = float(loss.detach())
         average = value if math.isnan(average) else 0.99 * average + 0.01 * value
-        if report is not None and (step % 100 == 0 or step == options.steps):
-            report(step, {"loss": average})
-        if step % 2000 == 0 or step == options.steps:
+        with times.stage("wait"):
+            is_stopped = processes.any(stopped())
+        is_last = step == options.steps or is_stopped
+        if processes.is_first and (step % 100 == 0 or is_last):
+            points = (step - done) * options.poses * options.points
+            figures = {"loss": average, "samples_per_second": points / times.seconds}
+            figures |= {f"share_{name}": share for name, share in times.shares().items()}
+            if report is not None:
+                report(step, figures)
+            if run is not None:
+                append_log(run, step, figures)
+        if processes.is_first and (step % options.checkpoint_every == 0 or is_last):
             save_prior(field, options, step)
+            if run is not None:
+                save_progress(run, step, field, optimizers, average)
+        if is_stopped and step < options.steps:
+            way = (
+                f"continue with --folder {options.folder}"
+                if options.folder
+                else f"so far: {options.out}"
+            )
+            raise Interrupted(f"stopped at step {step}; {way}")
     return field
 
 
-def _moved(posed: PosedHand, device: str) -> PosedHand:
-    if device == "cpu":
-        return posed
-    return PosedHand(
-        posed.rig, posed.pose, posed.vertices.to(device), posed.world_from_bone.to(device)
-    )
+def _what_to_learn(options: PriorOptions) -> dict[str, Any]:
+    """The options on which the weights depend, as JSON."""
+    elsewhere = ("out", "folder", "checkpoint_every", "device")
+    record = {name: value for name, value in asdict(options).items() if name not in elsewhere}
+    return {**record, "start_from": None if options.start_from is None else str(options.start_from)}
 
 
 def save_prior(field: OccupancyField, options: PriorOptions, step: int) -> None:
     """Writes the weights aside and renames them into place."""
     rig = load_open_hand(options.level)
-    record = {**asdict(options), "out": options.out.name, "start": str(options.start)}
+    record = {**_what_to_learn(options), "out": options.out.name}
     metadata = {
         "schema": "1",
         "rig": rig.name,

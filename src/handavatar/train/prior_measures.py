@@ -27,7 +27,8 @@ from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations, resolve_penetration, sample_poses
 from handavatar.hand.rig import PosedHand, Rig
 from handavatar.hand.surface import extract_hand
-from handavatar.train.prior import EVALUATION_SEED, sample_points
+from handavatar.train.labelled_poses import sample_points
+from handavatar.train.prior import EVALUATION_SEED
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,196 @@
+"""One step of the prior's pre-training: what is minimised, at which rate, and where it goes on."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from handavatar.avatar import CheckpointError
+from handavatar.field.decoders import OccupancyField
+from handavatar.field.occupancy import HandCodes, PairOccupancy
+from handavatar.hand.parts import Parts
+from handavatar.hand.rig import PosedHand
+from handavatar.train.labelled_poses import LabelledPose
+from handavatar.train.optimizer_state import (
+    optimizer_options,
+    optimizer_tensors,
+    restore_optimizer,
+)
+from handavatar.train.runs import (
+    Json,
+    Run,
+    latest_checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+    write_json,
+)
+from handavatar.train.stage_times import StageTimes
+
+LEAST_ERROR = 0.02
+"""A point whose occupancy is this close to its label has hardly a gradient, and is left out."""
+_WARM_UP = 0.02
+"""Share of the steps in which the learning rate rises: the moments must settle first."""
+_VECTOR_RATE = 0.6
+"""Learning rate of biases and narrow matrices, as a part of that of the others."""
+_NARROW = 8
+"""Matrices with so few rows or columns are no better than vectors for Muon."""
+
+
+class OccupancyLoss(nn.Module):
+    """Cross entropy between a field and the labels of some hands.
+
+    A module, because DistributedDataParallel joins the gradients of modules' forward passes.
+    """
+
+    def __init__(self, field: OccupancyField, parts: Parts, times: StageTimes) -> None:
+        """Joins what a step needs.
+
+        Args:
+            field: to be trained.
+            parts: of the stream's rig, on the field's device.
+            times: takes note of encoding, searching (which pairs decide, which points err) and
+                decoding.
+        """
+        super().__init__()
+        self.field = field
+        self.parts = parts
+        self.times = times
+
+    def forward(self, samples: Sequence[LabelledPose]) -> Float[Tensor, ""]:
+        """Mean over all points of all hands.
+
+        Source: paper Sec. 3.2, L_PairOF.
+        Departs: cross entropy instead of the mean squared error, whose gradient vanishes where a
+            saturated sigmoid errs; points without a noticeable error are left out.
+        """
+        loss = torch.zeros((), device=self.parts.barycentric.device)
+        for sample in samples:
+            posed, points = _moved(sample.posed, loss.device), sample.points.to(loss.device)
+            with self.times.stage("encode"):
+                codes = self.field.encode(self.parts, posed)
+            predicted, target = self._erring(codes, points, sample.is_inside.to(points))
+            total = nn.functional.binary_cross_entropy(predicted, target, reduction="sum")
+            loss = loss + total / (len(points) * len(samples))
+        return loss
+
+    def _erring(
+        self, codes: HandCodes, points: Float[Tensor, "points 3"], target: Float[Tensor, "points"]
+    ) -> tuple[Float[Tensor, "erring"], Float[Tensor, "erring"]]:
+        """Prediction with gradient and target, of the points with an error."""
+        if not isinstance(self.field, PairOccupancy):
+            # Nothing to gain: these decode once per point, not once per pair.
+            with self.times.stage("decode"):
+                predicted = self.field.trainable_whole(codes, points)
+            is_erring = (predicted.detach() - target).abs() > LEAST_ERROR
+            return predicted[is_erring], target[is_erring]
+        with self.times.stage("search"), torch.no_grad():
+            found = self.field(codes, points)
+            is_erring = (found.whole - target).abs() > LEAST_ERROR
+            items = found.items.among(is_erring)
+        with self.times.stage("decode"):
+            return self.field.of_items(codes, points[is_erring], items), target[is_erring]
+
+
+def prior_optimizers(field: OccupancyField) -> dict[str, torch.optim.Optimizer]:
+    """Muon for the matrices, Adam for all else; no rate is set yet.
+
+    Departs: the authors use Adam alone, with which the same time on a CPU gains half as much.
+    """
+    parameters = list(field.parameters())
+    is_wide = [p.ndim == 2 and min(p.shape) > _NARROW for p in parameters]
+    wide = [p for p, chosen in zip(parameters, is_wide, strict=True) if chosen]
+    narrow = [p for p, chosen in zip(parameters, is_wide, strict=True) if not chosen]
+    return {
+        # Steps as long as Adam's, so that one learning rate does for both.
+        "muon": torch.optim.Muon(wide, weight_decay=0.0, adjust_lr_fn="match_rms_adamw"),
+        "adam": torch.optim.Adam(narrow),
+    }
+
+
+def set_rate(optimizers: Mapping[str, torch.optim.Optimizer], rate: float) -> None:
+    """The learning rate of the next step, Muon's; Adam's follows."""
+    for name, optimizer in optimizers.items():
+        for group in optimizer.param_groups:
+            group["lr"] = rate if name == "muon" else _VECTOR_RATE * rate
+
+
+def learning_rate(step: int, steps: int, highest: float, lowest: float) -> float:
+    """Of a step, counted from 1: a short rise, then half a cosine down to the lowest."""
+    rise = min(1.0, step / max(_WARM_UP * steps, 1))
+    fall = 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
+    return rise * (lowest + (highest - lowest) * fall)
+
+
+# --- the run folder -------------------------------------------------------------------------------
+
+
+def begin_prior_run(folder: Path, options: Json) -> Run:
+    """The folder's run: a new one, or the one that was begun there with the same options.
+
+    Raises:
+        CheckpointError: if the folder holds something else, or a run with other options.
+    """
+    run, path = Run(folder), folder / "options.json"
+    if path.is_file():
+        begun = json.loads(path.read_text())
+        different = sorted(
+            name for name in {**begun, **options} if begun.get(name) != options.get(name)
+        )
+        if different:
+            raise CheckpointError(
+                f"{folder}: the run there was begun with other options: {', '.join(different)}\n"
+                "give the same ones to continue it, or name another folder with --folder"
+            )
+        return run
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise CheckpointError(
+            f"{folder}: holds something that is no pre-training run, expected a new folder\n"
+            "name another with --folder"
+        )
+    run.checkpoints.mkdir(parents=True)
+    write_json(path, options)
+    return run
+
+
+def save_progress(
+    run: Run,
+    step: int,
+    field: OccupancyField,
+    optimizers: Mapping[str, torch.optim.Optimizer],
+    average: float,
+) -> None:
+    """Writes everything that :func:`load_progress` needs to go on bit for bit."""
+    tensors = {"model": field.state_dict()}
+    tensors |= {name: optimizer_tensors(optimizer) for name, optimizer in optimizers.items()}
+    state: Json = {name: optimizer_options(optimizer) for name, optimizer in optimizers.items()}
+    save_checkpoint(run, step, tensors, {**state, "average": average})
+
+
+def load_progress(
+    run: Run, field: OccupancyField, optimizers: Mapping[str, torch.optim.Optimizer]
+) -> tuple[int, float]:
+    """Sets field and optimisers to the newest whole checkpoint.
+
+    Returns:
+        The steps done (0 if there is no checkpoint), and the running average of the loss.
+    """
+    checkpoint = latest_checkpoint(run)
+    if checkpoint is None:
+        return 0, math.nan
+    contents = load_checkpoint(checkpoint)
+    field.load_state_dict(contents.tensors["model"])
+    for name, optimizer in optimizers.items():
+        restore_optimizer(optimizer, contents.tensors[name], contents.state[name])
+    return checkpoint.step, float(contents.state["average"])
+
+
+def _moved(posed: PosedHand, device: torch.device) -> PosedHand:
+    if device.type == "cpu":
+        return posed
+    return PosedHand(
+        posed.rig, posed.pose, posed.vertices.to(device), posed.world_from_bone.to(device)
+    )

@@ -1,0 +1,67 @@
+"""Several processes that train one model: started by ``torchrun``, one gradient together."""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+import torch.distributed
+
+
+@dataclass(frozen=True)
+class Processes:
+    """This process among those that train together.
+
+    Attributes:
+        rank: of this one, from 0.
+        count: of all of them.
+        device: where this one computes, such as ``cpu`` or ``cuda:1``.
+    """
+
+    rank: int
+    count: int
+    device: str
+
+    @property
+    def is_first(self) -> bool:
+        """Whether this one writes files and reports."""
+        return self.rank == 0
+
+    def any(self, flag: bool) -> bool:
+        """Whether the flag is set in any process; all must ask, and all get the same answer."""
+        if self.count == 1:
+            return flag
+        value = torch.tensor(float(flag), device=self.device)
+        torch.distributed.all_reduce(value, torch.distributed.ReduceOp.MAX)
+        return bool(value)
+
+    def wait(self) -> None:
+        """Until all processes are here."""
+        self.any(False)
+
+
+def is_first_process() -> bool:
+    """Whether this process is alone, or the one of ``torchrun``'s that reports."""
+    return os.environ.get("RANK", "0") == "0"
+
+
+@contextmanager
+def joined_processes(device: str) -> Iterator[Processes]:
+    """Joins the processes that ``torchrun`` started; alone if it did not.
+
+    Args:
+        device: ``cpu``; or ``cuda``, of which every process on a machine takes another one.
+    """
+    count = int(os.environ.get("WORLD_SIZE", "1"))
+    if count == 1:
+        yield Processes(0, 1, device)
+        return
+    own = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if device == "cuda" else device
+    if own.startswith("cuda"):
+        torch.cuda.set_device(own)
+    torch.distributed.init_process_group("nccl" if own.startswith("cuda") else "gloo")
+    try:
+        yield Processes(torch.distributed.get_rank(), torch.distributed.get_world_size(), own)
+    finally:
+        torch.distributed.destroy_process_group()

@@ -1,0 +1,49 @@
+"""The stream that the prior learns from: endless, the same everywhere, and true."""
+
+import torch
+
+from handavatar.geometry.meshes import distance_to_mesh
+from handavatar.hand.open_hand import load_open_hand
+from handavatar.hand.parts import divide_into_parts
+from handavatar.train.labelled_poses import LabelledPose, PoseStream
+from handavatar.train.stage_times import StageTimes
+
+RIG = load_open_hand("778")
+PARTS = divide_into_parts(RIG)
+
+
+def _drawn(number: int, seed: int = 0) -> LabelledPose:
+    return PoseStream(RIG, RIG, PARTS, 0.012, 512, seed).drawn(number, StageTimes())
+
+
+def test_a_hand_of_the_stream_is_the_same_whenever_it_is_drawn() -> None:
+    first = _drawn(3)
+    _drawn(4)
+    again = _drawn(3)
+    assert torch.equal(first.points, again.points)
+    assert torch.equal(first.is_inside, again.is_inside)
+    for other in (_drawn(4), _drawn(3, seed=1), _drawn(4, seed=2)):
+        assert not torch.equal(first.posed.vertices, other.posed.vertices)
+
+
+def test_labels_equal_those_of_the_exact_winding_number() -> None:
+    """Van Oosterom and Strackee's solid angles, summed over every face, in float64."""
+    num_wrong = 0
+    for number in range(3):
+        sample = _drawn(number)
+        corners = sample.posed.sealed_vertices.double()[RIG.sealed_faces]
+        a, b, c = (corners[None, :, k] - sample.points.double()[:, None] for k in range(3))
+        volume = (a * torch.linalg.cross(b, c)).sum(-1)
+        la, lb, lc = (side.norm(dim=-1) for side in (a, b, c))
+        flat = la * lb * lc + (a * b).sum(-1) * lc + (b * c).sum(-1) * la + (c * a).sum(-1) * lb
+        winding = torch.atan2(volume, flat).sum(-1) / (2 * torch.pi)
+        num_wrong += int(((winding > 0.5) != sample.is_inside).sum())
+    # The far field is approximate, by less than 0.01; only points on the surface come that close.
+    assert num_wrong <= 1
+
+
+def test_most_points_lie_near_the_surface_and_some_anywhere() -> None:
+    sample = _drawn(0)
+    distance = distance_to_mesh(sample.posed.sealed_vertices, RIG.sealed_faces, sample.points)
+    assert float((distance[-461:] < 0.001).float().mean()) > 0.6
+    assert float((distance[:51] > 0.002).float().mean()) > 0.6

@@ -1,0 +1,141 @@
+"""Two processes on one machine learn what one learns; a killed training ends as an unbroken one."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import nullcontext
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+import handavatar.train.prior as prior
+from handavatar.avatar import CheckpointError
+from handavatar.train.labelled_poses import LabelledPose, PoseStream
+from handavatar.train.pretraining import begin_prior_run
+from handavatar.train.prior import PriorOptions, train_prior
+from handavatar.train.processes import Processes
+from handavatar.train.stage_times import StageTimes
+from handavatar.train.stopping import Interrupted
+
+WORDS = ["prior", "train", "--points", "64", "--level", "778", "--rounds", "0", "--poses", "2"]
+
+
+def _options(out: Path, steps: int) -> PriorOptions:
+    return PriorOptions(out, steps=steps, points=64, poses=2, level="778", rounds=0)
+
+
+def _begun(words: list[str], **environment: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "handavatar", *words],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
+    )
+
+
+def _two_begun(words: list[str]) -> list[subprocess.Popen[str]]:
+    """What torchrun sets, without its agent, which takes seconds to start."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    return [
+        _begun(
+            words,
+            RANK=str(rank),
+            LOCAL_RANK=str(rank),
+            WORLD_SIZE="2",
+            MASTER_ADDR="127.0.0.1",
+            MASTER_PORT=port,
+        )
+        for rank in range(2)
+    ]
+
+
+def _ended(processes: list[subprocess.Popen[str]]) -> tuple[list[int], str]:
+    try:
+        texts = [process.communicate(timeout=60)[1] for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    return [process.returncode for process in processes], "\n".join(texts)
+
+
+def test_two_processes_learn_what_one_learns_stop_together_and_continue(tmp_path: Path) -> None:
+    one = load_file(tmp_path / "one") if train_prior(_options(tmp_path / "one", 3)) else {}
+    words = [*WORDS, "--out", str(tmp_path / "two"), "--folder", str(tmp_path / "run")]
+    codes, text = _ended(_two_begun([*words, "--steps", "3"]))
+    assert codes == [0, 0], text
+    two = load_file(tmp_path / "two")
+    # The same hands, the mean of two gradients summed in another order: float rounding (6e-8 of
+    # a gradient), which Adam can blow up to a step of the learning rate, 1e-3, where a gradient
+    # is nothing but rounding. Hence nearly all weights agree to 1e-6, none differs by three steps.
+    difference = torch.cat([(two[name] - one[name]).abs().flatten() for name in one])
+    assert float((difference < 1e-6).float().mean()) > 0.999
+    assert float(difference.max()) < 3e-3
+    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in log] == [3]
+    assert log[0]["samples_per_second"] > 0
+    shares = [value for name, value in log[0].items() if name.startswith("share_")]
+    assert sum(shares) == pytest.approx(1)
+
+
+def test_processes_that_cannot_share_evenly_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(prior, "joined_processes", lambda _: nullcontext(Processes(0, 3, "cpu")))
+    with pytest.raises(ValueError, match="2 poses a step for 3 processes"):
+        train_prior(_options(tmp_path / "a", 1))
+
+
+def test_a_stopped_training_continues_bit_for_bit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = replace(_options(tmp_path / "b", 5), folder=tmp_path / "run", checkpoint_every=2)
+    whole = train_prior(replace(options, out=tmp_path / "a", folder=None)).state_dict()
+    drawn = PoseStream.drawn
+
+    def interrupted(stream: PoseStream, number: int, times: StageTimes) -> LabelledPose:
+        if number == 2 * 2:  # Amid step 3.
+            os.kill(os.getpid(), signal.SIGTERM)
+        return drawn(stream, number, times)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(PoseStream, "drawn", interrupted)
+        with pytest.raises(Interrupted, match="stopped at step 3; continue with --folder"):
+            train_prior(options)
+    # As if it had been killed later, after a checkpoint that the disk lost.
+    (tmp_path / "run" / "log.jsonl").open("a").write(json.dumps({"step": 4}) + "\n")
+    resumed = train_prior(options).state_dict()
+    assert all(torch.equal(resumed[name], whole[name]) for name in whole)
+    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in log] == [3, 5]
+    saved = load_file(tmp_path / "b")
+    assert all(torch.equal(saved[name], whole[name]) for name in whole)
+
+
+def test_a_run_is_continued_with_its_own_options_alone(tmp_path: Path) -> None:
+    begin_prior_run(tmp_path / "run", {"lr": 1, "seed": 0})
+    begin_prior_run(tmp_path / "run", {"lr": 1, "seed": 0})
+    with pytest.raises(CheckpointError, match="other options: lr, seed"):
+        begin_prior_run(tmp_path / "run", {"lr": 2, "seed": 1})
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "letter.txt").write_text("mine")
+    with pytest.raises(CheckpointError, match="no pre-training run"):
+        begin_prior_run(tmp_path / "full", {})
+
+
+def test_torchrun_leaves_our_options_alone() -> None:
+    """It reads the words behind the program's name too, and knows its own by their beginnings."""
+    from torch.distributed.run import get_args_parser
+
+    for field in fields(PriorOptions):
+        word = "--" + field.name.replace("_", "-")
+        parsed = get_args_parser().parse_args(["-m", "handavatar", "prior", "train", word, "1"])
+        assert parsed.training_script_args == ["prior", "train", word, "1"]
