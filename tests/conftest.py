@@ -28,6 +28,7 @@ TINY = Method(
     frames=1,
     patches=1,
     patch_size=16,
+    border_pixels=32,
     num_samples=12,
     silhouette_size=32,
     lr=5e-3,

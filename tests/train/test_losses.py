@@ -1,8 +1,9 @@
 """The losses of end-to-end training: each against its formula written out."""
 
+import pytest
 import torch
 
-from handavatar.train.losses import color_loss, occupancy_loss, offset_loss
+from handavatar.train.losses import border_loss, color_loss, occupancy_loss, offset_loss
 
 
 def _random(*shape: int) -> torch.Tensor:
@@ -56,3 +57,11 @@ def test_gradients_agree_with_finite_differences() -> None:
     assert torch.autograd.gradcheck(lambda p: occupancy_loss(p, is_inside), predicted)
     assert torch.autograd.gradcheck(lambda r: color_loss(r, truth), rendered)
     assert torch.autograd.gradcheck(lambda o: offset_loss(o, EDGES, 0.0025), offsets)
+
+
+def test_the_border_loss_is_the_share_of_wrongly_covered_pixels() -> None:
+    is_hand = torch.tensor([True, True, False, False])
+    assert float(border_loss(is_hand.float(), is_hand)) == 0
+    assert float(border_loss(torch.tensor([1.0, 0.5, 0.25, 0.0]), is_hand)) == pytest.approx(0.1875)
+    alpha = torch.tensor([0.7, 0.2, 0.4, 0.1], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda a: border_loss(a, is_hand), alpha)

@@ -18,10 +18,11 @@ from handavatar.field.shading import OrientedCues, PaperCues
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.rigs import find_rig
+from handavatar.render.silhouette import signed_distance
 from handavatar.train.appearance import SeenSamples, appearance_loss, find_seen_samples
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.labelled_poses import sample_points
-from handavatar.train.losses import color_loss, occupancy_loss
+from handavatar.train.losses import border_loss, color_loss, occupancy_loss
 from handavatar.train.optimizer_state import (
     optimizer_options,
     optimizer_tensors,
@@ -46,6 +47,9 @@ from handavatar.train.runs import (
 )
 from handavatar.train.stopping import Interrupted, stop_signals
 
+BORDER_REACH = 4.0
+"""Pixels."""
+
 
 @dataclass(frozen=True)
 class Method:
@@ -66,6 +70,7 @@ class Method:
         patch_size: pixels along a side.
         patch_strides: a patch takes every pixel, or every second, ...; drawn for each patch. Wide
             patches show more of the hand for the same work.
+        border_pixels: per frame; beside the mask's border the alpha is compared with the mask.
         perceptual_weight: of the perceptual loss beside the colour loss.
         num_samples: samples per ray while training.
         silhouette_size: the mask is compared at this many pixels along a side.
@@ -94,6 +99,7 @@ class Method:
     warm_pixels: int = 2560
     warm_stride: int = 6
     patch_strides: tuple[int, ...] = (1,)
+    border_pixels: int = 256
     perceptual_weight: float = 1.0
     lr: float = 5e-4
     lr_shape: float = 5e-4
@@ -109,7 +115,7 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "quick": Method(
-        steps=410,
+        steps=400,
         cues=OrientedCues(),
         warm_steps=300,
         frames=1,
@@ -122,7 +128,7 @@ METHODS: dict[str, Method] = {
         lr=2e-3,
         lr_shape=2e-3,
         lr_codes=1e-2,
-        lr_decoder=2e-4,
+        lr_decoder=4e-4,
         occupancy_every=4,
     ),
     "paper": Method(
@@ -438,23 +444,34 @@ def frame_losses(
         losses["occupancy"] = occupancy_loss(predicted, labels)
 
     settings = RenderSettings(num_samples=method.num_samples, smallest_weight=1e-6, stop=1e-5)
-    pixels = torch.cat(
-        [
-            patch_pixels(frame.mask, method.patch_size, method.patch_strides, generator)
-            for _ in range(method.patches)
-        ]
-    )
-    x, y = pixels.unbind(-1)
+    patches = [
+        patch_pixels(frame.mask, method.patch_size, method.patch_strides, generator)
+        for _ in range(method.patches)
+    ]
+    border = border_pixels(frame.mask, method.border_pixels, generator)
+    x, y = torch.cat([*patches, border]).unbind(-1)
     near = avatar.near_mesh(state, camera, settings.mask_margin)[y, x].nonzero()[:, 0]
     rays = rays_through_pixels(camera, pixel_centers(camera)[y, x][near])
     seen = avatar.render_rays(state, rays, settings, generator)
     black = torch.zeros(len(x), device=device)
-    alpha = black.index_copy(0, near, seen.alpha)[:, None]
+    alpha = black.index_copy(0, near, seen.alpha)
+    color = black[:, None].repeat(1, 3).index_copy(0, near, seen.color)
+    is_hand = frame.mask[y, x].to(device)
+    if len(border):
+        losses["border"] = border_loss(alpha[-len(border) :], is_hand[-len(border) :])
+
+    count = len(x) - len(border)
+    x, y, color, alpha, is_hand = (
+        x[:count],
+        y[:count],
+        color[:count],
+        alpha[:count],
+        is_hand[:count],
+    )
     background = torch.rand(3, generator=generator).to(device)
     truth = frame.image[y, x].to(device).float() / 255
-    is_hand = frame.mask[y, x].to(device)
     truth = torch.where(is_hand[:, None], truth, background)
-    color = black[:, None].repeat(1, 3).index_copy(0, near, seen.color) + (1 - alpha) * background
+    color = color + (1 - alpha[:, None]) * background
     losses["color"] = color_loss(color, truth)
     size = (method.patches, method.patch_size, method.patch_size)
     distance = perceptual(color.unflatten(0, size), truth.unflatten(0, size)).mean()
@@ -504,6 +521,18 @@ def patch_pixels(
     left = min(max(int(center[1]) - extent // 2, 0), width - extent)
     y, x = torch.meshgrid(top + steps, left + steps, indexing="ij")
     return torch.stack([x, y], dim=-1).flatten(0, 1)
+
+
+def border_pixels(
+    mask: Bool[Tensor, "height width"], count: int, generator: torch.Generator
+) -> Int[Tensor, "pixels 2"]:
+    """Pixels (x, y) at most ``BORDER_REACH`` from the border of the mask, drawn evenly.
+
+    As many as asked for, or as there are.
+    """
+    y, x = (signed_distance(mask).abs() < BORDER_REACH).nonzero().unbind(-1)
+    chosen = torch.randperm(len(x), generator=generator)[:count]
+    return torch.stack([x[chosen], y[chosen]], dim=-1)
 
 
 def _frame_number(num_frames: int, visit: int, seed: int) -> int:
