@@ -460,14 +460,9 @@ def frame_losses(
     if len(border):
         losses["border"] = border_loss(alpha[-len(border) :], is_hand[-len(border) :])
 
-    count = len(x) - len(border)
-    x, y, color, alpha, is_hand = (
-        x[:count],
-        y[:count],
-        color[:count],
-        alpha[:count],
-        is_hand[:count],
-    )
+    in_patches = slice(len(x) - len(border))
+    x, y, is_hand = x[in_patches], y[in_patches], is_hand[in_patches]
+    color, alpha = color[in_patches], alpha[in_patches]
     background = torch.rand(3, generator=generator).to(device)
     truth = frame.image[y, x].to(device).float() / 255
     truth = torch.where(is_hand[:, None], truth, background)
