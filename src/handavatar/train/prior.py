@@ -46,11 +46,14 @@ from handavatar.train.stage_times import StageTimes
 from handavatar.train.stopping import Interrupted, stop_signals
 
 SHIPPED_PRIOR = Path(__file__).parent.parent / "assets" / "prior.safetensors"
-"""Made at commit 214103c with ``handavatar prior train --steps 9000 --out a.safetensors`` and then
-``--start a.safetensors --steps 5000 --lr 6e-4 --final-lr 3e-5 --warm-up 0 --seed 1 --refresh 2``;
-the first run was made before the cut at the wrist was sampled. Since then poses come from an
-endless stream instead of a pool, points lie nearer to the surface and the loss is cross entropy,
-so that these words are no longer understood: check that commit out for them."""
+"""Made in three stages, each from the result of the last:
+
+1. at commit 214103c ``handavatar prior train --steps 9000 --out a.safetensors``, then ``--start
+   a.safetensors --steps 5000 --lr 6e-4 --final-lr 3e-5 --warm-up 0 --seed 1 --refresh 2`` (a pool of
+   poses and squared error, words that only that commit understands);
+2. at commit eb43742 ``--start-from A --steps 1000 --lr 4e-4 --final-lr 4e-6 --seed 21`` (Adam);
+3. at commit 7f644f9 ``--start-from B --steps 1200 --lr 5e-4 --final-lr 5e-6 --seed 22`` (Muon).
+"""
 EVALUATION_SEED = 1_000_003
 """Evaluation poses come from seeds that training never draws."""
 
