@@ -49,8 +49,8 @@ SHIPPED_PRIOR = Path(__file__).parent.parent / "assets" / "prior.safetensors"
 """Made in three stages, each from the result of the last:
 
 1. at commit 214103c ``handavatar prior train --steps 9000 --out a.safetensors``, then ``--start
-   a.safetensors --steps 5000 --lr 6e-4 --final-lr 3e-5 --warm-up 0 --seed 1 --refresh 2`` (a pool of
-   poses and squared error, words that only that commit understands);
+   a.safetensors --steps 5000 --lr 6e-4 --final-lr 3e-5 --warm-up 0 --seed 1 --refresh 2`` (a pool
+   of poses and squared error, words that only that commit understands);
 2. at commit eb43742 ``--start-from A --steps 1000 --lr 4e-4 --final-lr 4e-6 --seed 21`` (Adam);
 3. at commit 7f644f9 ``--start-from B --steps 1200 --lr 5e-4 --final-lr 5e-6 --seed 22`` (Muon).
 """
