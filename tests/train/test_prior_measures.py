@@ -9,9 +9,11 @@ import torch
 
 from handavatar.field.occupancy import PairOccupancy
 from handavatar.hand.open_hand import load_open_hand
-from handavatar.train.prior import load_prior
+from handavatar.train.prior import SHIPPED_PRIOR, load_prior
 from handavatar.train.prior_measures import (
+    MeshOptions,
     measure_prior,
+    measure_prior_file,
     summarised,
     unseen_fists,
     unseen_hands,
@@ -60,3 +62,11 @@ def test_unseen_hands_repeat_and_differ() -> None:
     fists = unseen_fists(rig, rig, 2)
     spread = (fists[0].pose.rotations - fists[1].pose.rotations)[1:].norm(dim=-1)
     assert 0 < float(spread.mean()) < math.radians(30)
+
+
+def test_a_prior_file_is_measured_on_unseen_poses_and_fists_if_asked() -> None:
+    assert measure_prior_file(SHIPPED_PRIOR, "778", 0, MeshOptions(meshes=0)) == {}
+    found = measure_prior_file(SHIPPED_PRIOR, "778", 0, MeshOptions(meshes=1, resolution=16))
+    assert set(found) == {"unseen", "fists"}
+    assert found["fists"]["contact_error"]["count"] == 1
+    assert all(columns["cham"]["mean"] > 0 for columns in found.values())

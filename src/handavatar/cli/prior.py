@@ -31,11 +31,21 @@ def train(words: list[str]) -> int:
 
 def evaluate(words: list[str]) -> int:
     """How well a prior knows inside from outside, on unseen poses and shapes."""
-    from handavatar.cli.arguments import JSON, parse_with, print_figures, print_json
+    from handavatar.cli.arguments import JSON, Extra, parse_with, print_figures, print_json
     from handavatar.train.prior import PriorEvaluationOptions, evaluate_prior
+    from handavatar.train.prior_measures import MeshOptions, measure_prior_file
 
-    options, extras = parse_with(PriorEvaluationOptions, (JSON,), words, "prior evaluate")
-    (print_json if extras["json"] else print_figures)(evaluate_prior(options))
+    extras_wanted = (
+        Extra("meshes", int, "extract meshes of so many unseen poses and fists as well", 0),
+        Extra("resolution", int, "cells along the longest side of their box", 128),
+        JSON,
+    )
+    options, extras = parse_with(PriorEvaluationOptions, extras_wanted, words, "prior evaluate")
+    meshes = MeshOptions(extras["meshes"], extras["resolution"])
+    figures = evaluate_prior(options) | measure_prior_file(
+        options.prior, options.level, options.rounds, meshes
+    )
+    (print_json if extras["json"] else print_figures)(figures)
     return 0
 
 

@@ -4,6 +4,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from math import degrees
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -22,13 +23,15 @@ from handavatar.evaluate.geometry import (
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.field.decoders import OccupancyField
 from handavatar.geometry.extraction import Field, num_components
+from handavatar.hand.detail import subdivided
+from handavatar.hand.open_hand import Level, load_open_hand
 from handavatar.hand.parts import PartBoxes, divide_into_parts
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations, resolve_penetration, sample_poses
 from handavatar.hand.rig import PosedHand, Rig
 from handavatar.hand.surface import extract_hand
 from handavatar.train.labelled_poses import sample_points
-from handavatar.train.prior import EVALUATION_SEED
+from handavatar.train.prior import EVALUATION_SEED, open_prior
 
 
 @dataclass(frozen=True)
@@ -209,6 +212,41 @@ def measure_field(
         saved=surface.num_dense / surface.num_evaluations,
         seconds=seconds,
     )
+
+
+@dataclass(frozen=True)
+class MeshOptions:
+    """Meshes that ``prior evaluate`` extracts beside its points.
+
+    Attributes:
+        meshes: from so many unseen poses, and as many fists; 0 extracts none.
+        resolution: cells along the longest side of the extraction's box.
+    """
+
+    meshes: int = 0
+    resolution: int = 128
+
+
+def measure_prior_file(
+    prior: Path, level: Level, rounds: int, options: MeshOptions
+) -> dict[str, dict[str, dict[str, float | int | None]]]:
+    """Every column on unseen poses and on fists, summarised; none where no mesh is asked for.
+
+    Args:
+        prior: file of the weights.
+        level: which open hand.
+        rounds: midpoint subdivisions of the mesh that guides.
+        options: how many, how finely.
+    """
+    if options.meshes < 1:
+        return {}
+    field = open_prior(prior)
+    base = load_open_hand(level)
+    rig = subdivided(base, rounds)
+    return {
+        name: summarised(measure_prior(field, hands(rig, base, options.meshes), options.resolution))
+        for name, hands in (("unseen", unseen_hands), ("fists", unseen_fists))
+    }
 
 
 def summarised(rows: Sequence[GeometryRow]) -> dict[str, dict[str, float | int | None]]:
