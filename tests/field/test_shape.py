@@ -35,7 +35,9 @@ def test_the_pose_as_a_bias_equals_the_pose_as_an_input() -> None:
     torch.manual_seed(0)
     rig = load_open_hand("778")
     rest, rotations, field = rig.shaped(), _rotations(), ShapeOffsets()
-    centred = (rest.rest_vertices - (rig.joint_regressor @ rig.template_vertices).mean(0)) / HAND_SCALE
+    centred = (
+        rest.rest_vertices - (rig.joint_regressor @ rig.template_vertices).mean(0)
+    ) / HAND_SCALE
     encoded = positional_encoding(centred, NUM_FREQUENCIES)
     pose = rotations[1:].flatten().expand(len(encoded), -1)
     inputs = torch.cat([encoded, pose], dim=-1)
