@@ -12,8 +12,9 @@ from handavatar.capture.frames import Frame, write_capture
 from handavatar.geometry.cameras import Camera, look_at
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.hand.open_hand import load_open_hand
+from handavatar.hand.parts import Parts, divide_into_parts
 from handavatar.hand.pose import NUM_BONES, HandPose
-from handavatar.hand.rig import Rig
+from handavatar.hand.rig import PosedHand, Rig
 from handavatar.render.rasterize import interpolate, rasterize
 from handavatar.train.loop import Method
 from handavatar.train.prior import load_prior
@@ -125,3 +126,23 @@ def small_avatar() -> HandAvatar:
         avatar.albedo.codes.mul_(10)
         avatar.shape.mlp.output.weight.mul_(100 / math.sqrt(3))
     return avatar
+
+
+def any_pose(rig: Rig, turn: float = 0.0, shift: float = 0.0) -> PosedHand:
+    """One random pose, the same at every call, with the wrist turned (radians) and moved."""
+    generator = torch.Generator().manual_seed(1)
+    rotations = 0.3 * torch.randn(NUM_BONES, 3, generator=generator)
+    rotations[0] = turn * torch.tensor([0.6, 0.0, 0.8])
+    return rig.shaped().posed(HandPose(rotations, shift * torch.tensor([1.0, -2.0, 3.0])))
+
+
+@pytest.fixture(scope="session")
+def rig() -> Rig:
+    """The 778-vertex hand; read only."""
+    return load_open_hand("778")
+
+
+@pytest.fixture(scope="session")
+def parts(rig: Rig) -> Parts:
+    """Its parts; read only."""
+    return divide_into_parts(rig)

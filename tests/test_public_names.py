@@ -19,7 +19,7 @@ EXACTLY = {
         "BONE_NAMES BONE_PARENTS CONNECTED_PAIRS FINGER_BONES HandPose NUM_BONES "
         "bone_transforms linear_blend_skinning"
     ),
-    "hand.rig": "LicensedRigMissing PosedHand Rig RigError ShapedHand",
+    "hand.rig": "RIG_ARRAYS LicensedRigMissing PosedHand Rig RigError ShapedHand",
     "hand.open_hand": "Level load_open_hand",
     "hand.mano": (
         "FINGERTIPS LICENCE LeftShape ManoModel Side WHERE_TO_GET_IT absolute_rotations "

@@ -33,7 +33,7 @@ from handavatar.geometry.meshes import SurfacePoints, vertex_normals
 from handavatar.hand.detail import subdivided
 from handavatar.hand.parts import Parts, divide_into_parts
 from handavatar.hand.pose import HandPose
-from handavatar.hand.rig import PosedHand, Rig, ShapedHand
+from handavatar.hand.rig import RIG_ARRAYS, PosedHand, Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
 from handavatar.render.rasterize import rasterize
 from handavatar.render.sampling import depths_along, intervals_through_boxes
@@ -42,23 +42,13 @@ from handavatar.render.volume import composite_sparse, visibility
 SCHEMA = 1
 START_LIGHT = 0.65
 """Illumination of an untrained avatar: room to grow brighter and darker."""
-_RIG_TENSORS = (
-    "template_vertices",
-    "faces",
-    "skin_weights",
-    "joint_regressor",
-    "shape_directions",
-    "uv_coordinates",
-    "uv_faces",
-    "joint_axes",
-)
 _OF_LICENSED_RIG = ("illumination.position_codes",)
 """Weights that a licensed rig's arrays could be read from; they follow from the rig."""
 
 
 def _stored_rig(name: str, tensors: dict[str, Tensor]) -> Rig:
     sets = {key[4:]: value for key, value in tensors.items() if key.startswith("set.")}
-    arrays: dict[str, Any] = {key: tensors[f"rig.{key}"] for key in _RIG_TENSORS}
+    arrays: dict[str, Any] = {key: tensors[f"rig.{key}"] for key in RIG_ARRAYS}
     if "rig.pose_directions" in tensors:
         arrays["pose_directions"] = tensors["rig.pose_directions"]
     return Rig(name=name, vertex_sets=sets, **arrays)
@@ -494,7 +484,7 @@ class HandAvatar(nn.Module):
             for name in _OF_LICENSED_RIG:
                 del tensors[f"avatar.{name}"]
         else:
-            tensors |= {f"rig.{name}": getattr(self.base_rig, name) for name in _RIG_TENSORS}
+            tensors |= {f"rig.{name}": getattr(self.base_rig, name) for name in RIG_ARRAYS}
             tensors |= {f"set.{name}": value for name, value in self.base_rig.vertex_sets.items()}
             if self.base_rig.pose_directions.numel():
                 tensors["rig.pose_directions"] = self.base_rig.pose_directions

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from conftest import any_pose
 from torch import Tensor
 
 from handavatar.field.occupancy import (
@@ -17,27 +18,9 @@ from handavatar.field.occupancy import (
     soft_occupancy,
 )
 from handavatar.geometry.rotations import apply_rigid
-from handavatar.hand.open_hand import load_open_hand
-from handavatar.hand.parts import Parts, divide_into_parts
-from handavatar.hand.pose import CONNECTED_PAIRS, NUM_BONES, HandPose
+from handavatar.hand.parts import Parts
+from handavatar.hand.pose import CONNECTED_PAIRS, NUM_BONES
 from handavatar.hand.rig import PosedHand, Rig
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    return load_open_hand("778")
-
-
-@pytest.fixture(scope="module")
-def parts(rig: Rig) -> Parts:
-    return divide_into_parts(rig)
-
-
-def _posed(rig: Rig, turn: float = 0.0, shift: float = 0.0) -> PosedHand:
-    generator = torch.Generator().manual_seed(1)
-    rotations = 0.3 * torch.randn(NUM_BONES, 3, generator=generator)
-    rotations[0] = turn * torch.tensor([0.6, 0.0, 0.8])
-    return rig.shaped().posed(HandPose(rotations, shift * torch.tensor([1.0, -2.0, 3.0])))
 
 
 def _field(fusion: MaximumFusion | SoftmaxFusion | None = None) -> PairOccupancy:
@@ -137,7 +120,7 @@ def test_soft_occupancy_keeps_order_and_surface_and_tells_far_from_near() -> Non
 def test_the_fast_evaluation_equals_the_plain_one(
     rig: Rig, parts: Parts, fusion: MaximumFusion | SoftmaxFusion
 ) -> None:
-    field, posed = _field(fusion), _posed(rig)
+    field, posed = _field(fusion), any_pose(rig)
     codes, points = field.encode(parts, posed), _points(posed)
     with torch.no_grad():
         whole, soft = field.plain(codes, points)
@@ -151,7 +134,7 @@ def test_the_fast_evaluation_equals_the_plain_one(
 def test_the_gradient_through_the_winning_pairs_is_the_whole_gradient(
     rig: Rig, parts: Parts
 ) -> None:
-    field, posed = _field(), _posed(rig)
+    field, posed = _field(), any_pose(rig)
     points = _points(posed, 300)
     items = field(field.encode(parts, posed), points).items
     parameters = list(field.parameters())
@@ -171,7 +154,7 @@ def test_the_gradient_through_the_winning_pairs_is_the_whole_gradient(
 
 
 def test_moving_hand_and_points_together_changes_nothing(rig: Rig, parts: Parts) -> None:
-    field, here, there = _field(), _posed(rig), _posed(rig, turn=1.2, shift=0.1)
+    field, here, there = _field(), any_pose(rig), any_pose(rig, turn=1.2, shift=0.1)
     there_from_here = there.world_from_bone[0] @ torch.linalg.inv(here.world_from_bone[0])
     points = _points(here)
     moved = apply_rigid(there_from_here, points)
@@ -185,7 +168,7 @@ def test_moving_hand_and_points_together_changes_nothing(rig: Rig, parts: Parts)
 
 
 def test_nothing_lies_outside_every_box(rig: Rig, parts: Parts) -> None:
-    field, posed = _field(), _posed(rig)
+    field, posed = _field(), any_pose(rig)
     codes = field.encode(parts, posed)
     points = _points(posed)
     is_in_box = contains(codes.boxes, local_points(codes.boxes, points))
@@ -197,12 +180,12 @@ def test_nothing_lies_outside_every_box(rig: Rig, parts: Parts) -> None:
 
 def test_no_points_give_no_values(rig: Rig, parts: Parts) -> None:
     field = _field()
-    result = field(field.encode(parts, _posed(rig)), torch.zeros(0, 3))
+    result = field(field.encode(parts, any_pose(rig)), torch.zeros(0, 3))
     assert result.whole.shape == (0,) and result.soft_parts.shape == (0, NUM_BONES)
 
 
 def test_local_points_are_those_of_the_inverse_bone_transforms(rig: Rig, parts: Parts) -> None:
-    posed = _posed(rig, turn=0.7, shift=0.2)
+    posed = any_pose(rig, turn=0.7, shift=0.2)
     boxes = parts.boxes(posed, 0.01)
     points = _points(posed, 20)
     found = local_points(boxes, points)
@@ -212,7 +195,7 @@ def test_local_points_are_those_of_the_inverse_bone_transforms(rig: Rig, parts: 
 
 
 def test_the_fade_is_one_inside_and_gone_at_the_margin(rig: Rig, parts: Parts) -> None:
-    boxes = parts.boxes(_posed(rig), 0.01)
+    boxes = parts.boxes(any_pose(rig), 0.01)
     middle = (boxes.lower + boxes.upper) / 2
     outward = torch.zeros(5, NUM_BONES, 3)
     steps = torch.tensor([-0.001, 0.0, 0.005, 0.01, 0.02])
@@ -223,7 +206,7 @@ def test_the_fade_is_one_inside_and_gone_at_the_margin(rig: Rig, parts: Parts) -
 
 
 def test_a_point_decided_by_no_part_has_no_item(rig: Rig, parts: Parts) -> None:
-    field, posed = _field(), _posed(rig)
+    field, posed = _field(), any_pose(rig)
     codes: HandCodes = field.encode(parts, posed)
     points = torch.cat([posed.vertices[:3], torch.full((2, 3), 5.0)])
     assert field(codes, points).items.points.tolist() == [0, 1, 2]

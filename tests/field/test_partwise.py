@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from conftest import any_pose
 from torch import Tensor
 
 from handavatar.field.coap import CoapDecoder
@@ -17,29 +18,11 @@ from handavatar.field.occupancy import (
 from handavatar.field.partwise import PartwiseOccupancy
 from handavatar.field.transformer import TransformerDecoder
 from handavatar.geometry.rotations import apply_rigid
-from handavatar.hand.open_hand import load_open_hand
-from handavatar.hand.parts import Parts, divide_into_parts
-from handavatar.hand.pose import NUM_BONES, HandPose
+from handavatar.hand.parts import Parts
+from handavatar.hand.pose import NUM_BONES
 from handavatar.hand.rig import PosedHand, Rig
 
 KINDS = ("coap", "transformer")
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    return load_open_hand("778")
-
-
-@pytest.fixture(scope="module")
-def parts(rig: Rig) -> Parts:
-    return divide_into_parts(rig)
-
-
-def _posed(rig: Rig, turn: float = 0.0, shift: float = 0.0) -> PosedHand:
-    generator = torch.Generator().manual_seed(1)
-    rotations = 0.3 * torch.randn(NUM_BONES, 3, generator=generator)
-    rotations[0] = turn * torch.tensor([0.6, 0.0, 0.8])
-    return rig.shaped().posed(HandPose(rotations, shift * torch.tensor([1.0, -2.0, 3.0])))
 
 
 def _field(kind: str) -> PartwiseOccupancy:
@@ -87,7 +70,7 @@ def _slow_logits(field: PartwiseOccupancy, codes: HandCodes, point: Tensor) -> l
 def test_the_field_agrees_with_a_loop_over_points_and_parts(
     rig: Rig, parts: Parts, kind: str
 ) -> None:
-    field, posed = _field(kind), _posed(rig)
+    field, posed = _field(kind), any_pose(rig)
     codes, points = field.encode(parts, posed), _points(posed, 60)
     found = field(codes, points)
     for index, point in enumerate(points):
@@ -106,7 +89,7 @@ def test_the_field_agrees_with_a_loop_over_points_and_parts(
 def test_pieces_change_nothing_and_the_trainable_value_is_the_same(
     rig: Rig, parts: Parts, kind: str
 ) -> None:
-    field, posed = _field(kind), _posed(rig)
+    field, posed = _field(kind), any_pose(rig)
     codes, points = field.encode(parts, posed), _points(posed)
     whole = field.trainable_whole(codes, points)
     assert whole.requires_grad and not field(codes, points).whole.requires_grad
@@ -115,7 +98,7 @@ def test_pieces_change_nothing_and_the_trainable_value_is_the_same(
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_moving_hand_and_points_together_changes_nothing(rig: Rig, parts: Parts, kind: str) -> None:
-    field, here, there = _field(kind), _posed(rig), _posed(rig, turn=1.2, shift=0.1)
+    field, here, there = _field(kind), any_pose(rig), any_pose(rig, turn=1.2, shift=0.1)
     there_from_here = there.world_from_bone[0] @ torch.linalg.inv(here.world_from_bone[0])
     points = _points(here)
     moved = apply_rigid(there_from_here, points)
@@ -129,7 +112,7 @@ def test_moving_hand_and_points_together_changes_nothing(rig: Rig, parts: Parts,
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_nothing_lies_outside_every_box(rig: Rig, parts: Parts, kind: str) -> None:
-    field, posed = _field(kind), _posed(rig)
+    field, posed = _field(kind), any_pose(rig)
     codes, points = field.encode(parts, posed), _points(posed)
     is_in_box = contains(codes.boxes, local_points(codes.boxes, points))
     result = field(codes, points)
@@ -157,7 +140,7 @@ def test_gradients_agree_with_finite_differences(kind: str) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_training_reaches_every_weight(rig: Rig, parts: Parts, kind: str) -> None:
-    field, posed = _field(kind), _posed(rig)
+    field, posed = _field(kind), any_pose(rig)
     field.trainable_whole(field.encode(parts, posed), _points(posed, 200)).sum().backward()
     for name, parameter in field.named_parameters():
         assert parameter.grad is not None, name

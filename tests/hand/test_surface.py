@@ -10,23 +10,12 @@ from torch import Tensor
 from handavatar.field.occupancy import PairOccupancy
 from handavatar.geometry.extraction import ExtractedSurface, extract_surface, num_components
 from handavatar.geometry.rotations import apply_rigid
-from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import Parts, divide_into_parts
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand, Rig, RigError
 from handavatar.hand.surface import extract_hand
 from handavatar.train.prior import load_prior
-
-
-@pytest.fixture(scope="module")
-def rig() -> Rig:
-    return load_open_hand("778")
-
-
-@pytest.fixture(scope="module")
-def parts(rig: Rig) -> Parts:
-    return divide_into_parts(rig)
 
 
 @pytest.fixture(scope="module")

@@ -100,10 +100,11 @@ def test_the_judging_poses_are_those_of_prior_evaluate(
 
 def test_the_table_has_a_line_for_each_decoder(compared: tuple[Path, dict[str, Any]]) -> None:
     _, value = compared
-    lines = comparison_table(value).splitlines()
+    shown = comparison_table(value).markdown().splitlines()
+    lines = [line for line in shown if line.startswith("|")]
     assert len(lines) == 2 + 3
     assert len({line.count("|") for line in lines}) == 1
-    assert "covered" in lines[0] and "232,513" in lines[2] and "| - |" in lines[3]
+    assert "covered" in lines[0] and "232,513" in lines[2] and "| – |" in lines[3]
 
 
 def test_every_decoder_sees_the_same_points(

@@ -7,11 +7,11 @@ from dataclasses import asdict
 import pytest
 import torch
 
+from handavatar import cli
 from handavatar.field.occupancy import PairOccupancy
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.train.prior import SHIPPED_PRIOR, load_prior
 from handavatar.train.prior_measures import (
-    MeshOptions,
     measure_prior,
     measure_prior_file,
     summarised,
@@ -64,9 +64,26 @@ def test_unseen_hands_repeat_and_differ() -> None:
     assert 0 < float(spread.mean()) < math.radians(30)
 
 
-def test_a_prior_file_is_measured_on_unseen_poses_and_fists_if_asked() -> None:
-    assert measure_prior_file(SHIPPED_PRIOR, "778", 0, MeshOptions(meshes=0)) == {}
-    found = measure_prior_file(SHIPPED_PRIOR, "778", 0, MeshOptions(meshes=1, resolution=16))
+def test_prior_evaluate_extracts_meshes_only_if_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    words = [
+        "prior",
+        "evaluate",
+        "--poses",
+        "1",
+        "--points",
+        "64",
+        "--level",
+        "778",
+        "--rounds",
+        "0",
+        "--json",
+    ]
+    assert cli.main(words) == 0
+    assert set(json.loads(capsys.readouterr().out)) == {"iou", "iou_boxes", "iou_surface"}
+
+
+def test_a_prior_file_is_measured_on_unseen_poses_and_fists() -> None:
+    found = measure_prior_file(SHIPPED_PRIOR, "778", 0, count=1, resolution=16)
     assert set(found) == {"unseen", "fists"}
     assert found["fists"]["contact_error"]["count"] == 1
     assert all(columns["cham"]["mean"] > 0 for columns in found.values())

@@ -33,7 +33,7 @@ def evaluate(words: list[str]) -> int:
     """How well a prior knows inside from outside, on unseen poses and shapes."""
     from handavatar.cli.arguments import JSON, Extra, parse_with, print_figures, print_json
     from handavatar.train.prior import PriorEvaluationOptions, evaluate_prior
-    from handavatar.train.prior_measures import MeshOptions, measure_prior_file
+    from handavatar.train.prior_measures import measure_prior_file
 
     extras_wanted = (
         Extra("meshes", int, "extract meshes of so many unseen poses and fists as well", 0),
@@ -41,10 +41,11 @@ def evaluate(words: list[str]) -> int:
         JSON,
     )
     options, extras = parse_with(PriorEvaluationOptions, extras_wanted, words, "prior evaluate")
-    meshes = MeshOptions(extras["meshes"], extras["resolution"])
-    figures = evaluate_prior(options) | measure_prior_file(
-        options.prior, options.level, options.rounds, meshes
-    )
+    figures: dict[str, object] = {**evaluate_prior(options)}
+    if extras["meshes"] > 0:
+        figures |= measure_prior_file(
+            options.prior, options.level, options.rounds, extras["meshes"], extras["resolution"]
+        )
     (print_json if extras["json"] else print_figures)(figures)
     return 0
 

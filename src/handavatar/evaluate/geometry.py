@@ -37,17 +37,6 @@ JOINED_REACH = 12e-3
 """Metres along the skin within which parts are joined to each other, not in contact."""
 
 
-def intersection_over_union(
-    predicted: Bool[Tensor, "points"], truth: Bool[Tensor, "points"]
-) -> float:
-    """1 where both are empty.
-
-    Source: paper Sec. 4.1, IoU.
-    """
-    union = int((predicted | truth).sum())
-    return float((predicted & truth).sum()) / union if union else 1.0
-
-
 def roughness(vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"]) -> float:
     """Mean distance of a vertex from the mean of its neighbours, metres; grows with the voxel.
 

@@ -77,7 +77,10 @@ def ssim(
 
 
 def mask_iou(first: Bool[Tensor, "*pixels"], second: Bool[Tensor, "*pixels"]) -> float:
-    """Intersection over union of two masks; 1 if both are empty."""
+    """Intersection over union of two masks, or of what two fields hold; 1 if both are empty.
+
+    Source: paper Sec. 4.1, IoU.
+    """
     union = int((first | second).sum())
     return int((first & second).sum()) / union if union else 1.0
 

@@ -36,4 +36,6 @@ class ResultTable:
 
 
 def _text(cell: Cell) -> str:
+    if isinstance(cell, int):
+        return f"{cell:,}"
     return "–" if cell is None else str(cell)

@@ -21,6 +21,19 @@ from handavatar.hand.pose import NUM_BONES, HandPose, bone_transforms, linear_bl
 _NUM_POSE_FEATURES = 9 * (NUM_BONES - 1)
 
 
+RIG_ARRAYS = (
+    "template_vertices",
+    "faces",
+    "skin_weights",
+    "joint_regressor",
+    "shape_directions",
+    "uv_coordinates",
+    "uv_faces",
+    "joint_axes",
+)
+"""What every rig has; files of rigs and avatars store these by name."""
+
+
 class RigError(ValueError):
     """A rig that cannot be used: what was found, what was expected, what to do."""
 

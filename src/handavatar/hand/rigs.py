@@ -13,22 +13,12 @@ from safetensors import torch as safetensors_torch
 
 from handavatar.hand.mano import LICENCE, WHERE_TO_GET_IT, ManoModel
 from handavatar.hand.open_hand import load_open_hand
-from handavatar.hand.rig import LicensedRigMissing, Rig, RigError
+from handavatar.hand.rig import RIG_ARRAYS, LicensedRigMissing, Rig, RigError
 
 SCHEMA = 1
 _MAX_BYTES = 64 * 2**20
 _SET_PREFIX = "set_"
-_TENSORS = (
-    "template_vertices",
-    "faces",
-    "skin_weights",
-    "joint_regressor",
-    "shape_directions",
-    "uv_coordinates",
-    "uv_faces",
-    "joint_axes",
-    "pose_directions",
-)
+_TENSORS = (*RIG_ARRAYS, "pose_directions")
 
 
 def rigs_folder() -> Path:

@@ -4,6 +4,7 @@ The core of ``handavatar bench --table geometry``. Same poses, shapes, points an
 number of steps, same seeds, same encoder at the start: only the decoder differs.
 """
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -15,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from handavatar.evaluate.intervals import mean_interval
+from handavatar.evaluate.tables import Cell, ResultTable
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
 from handavatar.field.occupancy import HandCodes
 from handavatar.field.partwise import PartwiseOccupancy
@@ -152,26 +154,41 @@ def compare_decoders(
     return value
 
 
-def comparison_table(value: Mapping[str, Any]) -> str:
-    """The result of :func:`compare_decoders` as a table in Markdown; IoU in per cent."""
-    known = {"parameters", "iou", "iou_boxes", "iou_surface", "iou_points_per_100k"}
-    known |= {"training_seconds", "minus_pair", "minus_pair_over_seeds"}
-    rows: Mapping[str, Mapping[str, Any]] = value["decoders"]
-    measured = [name for name in rows["pair"] if name not in known]
-    head = ["decoder", "parameters", "IoU", "in boxes", "near surface", "IoU - pair [95 %]"]
-    lines = [[*head, "IoU per 100K", *measured]]
-    for name, row in rows.items():
-        difference = row.get("minus_pair", {}).get("iou")
-        compared = "-"
-        if difference is not None:
-            mean, low, high = (100 * difference[key] for key in ("mean", "low", "high"))
-            compared = f"{mean:+.2f} [{low:+.2f}, {high:+.2f}]"
-        ious = [f"{100 * row[key]:.2f}" for key in ("iou", "iou_boxes", "iou_surface")]
-        share = f"{row['iou_points_per_100k']:.1f}"
-        further = [f"{row[key]:.4g}" for key in measured]
-        lines.append([name, f"{row['parameters']:,}", *ious, compared, share, *further])
-    lines.insert(1, ["---"] * len(lines[0]))
-    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+def comparison_table(value: Mapping[str, Any]) -> ResultTable:
+    """The result of :func:`compare_decoders` as a table; IoU in per cent."""
+    notes = [str(value["note"])]
+    if "control_hurts" in value:
+        hurts = "hurt" if value["control_hurts"] else "do not hurt: the table says nothing"
+        notes.append(f"Control: shuffled pairs {hurts}.")
+    rows = {name: _cells(row) for name, row in value["decoders"].items()}
+    return ResultTable("Geometry: decoders of the occupancy field", rows, tuple(notes))
+
+
+_OWN_FIGURES = (
+    *("parameters", "iou", "iou_boxes", "iou_surface", "iou_points_per_100k"),
+    *("training_seconds", "minus_pair", "minus_pair_over_seeds"),
+)
+
+
+def _cells(row: Mapping[str, Any]) -> dict[str, Cell]:
+    difference = row.get("minus_pair", {}).get("iou")
+    compared = None
+    if difference is not None:
+        mean, low, high = (100 * difference[key] for key in ("mean", "low", "high"))
+        compared = f"{mean:+.2f} [{low:+.2f}, {high:+.2f}]"
+    cells: dict[str, Cell] = {
+        "parameters": row["parameters"],
+        "IoU": round(100 * row["iou"], 2),
+        "in boxes": round(100 * row["iou_boxes"], 2),
+        "near surface": round(100 * row["iou_surface"], 2),
+        "IoU - pair [95 %]": compared,
+        "IoU per 100K": round(row["iou_points_per_100k"], 1),
+    }
+    measured = {name: figure for name, figure in row.items() if name not in _OWN_FIGURES}
+    return cells | {
+        name: round(figure, 3) if math.isfinite(figure) else None
+        for name, figure in measured.items()
+    }
 
 
 def _check(options: ComparisonOptions) -> None:

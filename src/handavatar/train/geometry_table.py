@@ -2,18 +2,17 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import torch
 
 from handavatar.evaluate.geometry import Skin, Truth
-from handavatar.evaluate.tables import Cell, ResultTable
+from handavatar.evaluate.tables import ResultTable
 from handavatar.field.decoders import OccupancyField
 from handavatar.field.occupancy import HandCodes
-from handavatar.hand.parts import divide_into_parts
+from handavatar.hand.parts import Parts, divide_into_parts
 from handavatar.hand.rig import PosedHand
-from handavatar.train.comparison import ComparisonOptions, compare_decoders
+from handavatar.train.comparison import ComparisonOptions, compare_decoders, comparison_table
 from handavatar.train.labelled_poses import sample_points
 from handavatar.train.prior import EVALUATION_SEED
 from handavatar.train.prior_measures import measure_field
@@ -46,22 +45,23 @@ class MeshMeasure:
     def __init__(self, resolution: int) -> None:
         """At a resolution of the extraction."""
         self._resolution = resolution
-        self._skins: dict[str, Skin] = {}
+        self._of_rig: dict[str, tuple[Skin, Parts]] = {}
 
     def __call__(
         self, field: OccupancyField, codes: HandCodes, posed: PosedHand
     ) -> Mapping[str, float]:
         """Figures of one field in one pose; lengths in 1e-4 m, angles in degrees."""
         rig = posed.rig
-        if rig.sha256 not in self._skins:
-            self._skins[rig.sha256] = Skin.of(rig)
+        if rig.sha256 not in self._of_rig:
+            self._of_rig[rig.sha256] = Skin.of(rig), divide_into_parts(rig)
+        skin, parts = self._of_rig[rig.sha256]
         generator = torch.Generator().manual_seed(EVALUATION_SEED)
-        points = sample_points(divide_into_parts(rig), posed, 64, field.margin, generator)
+        points = sample_points(parts, posed, 64, field.margin, generator)
         try:
             row = measure_field(
                 lambda places: field(codes, places).whole,
                 codes.boxes,
-                Truth(posed, self._skins[rig.sha256]),
+                Truth(posed, skin),
                 points,
                 self._resolution,
                 generator,
@@ -91,34 +91,11 @@ def geometry_table(
         if report is not None:
             report(sum(done.values()))
 
-    value = compare_decoders(options, (MeshMeasure(options.resolution),), progress)
-    rows = {name: _row(row) for name, row in value["decoders"].items()}
-    notes = [
+    measure = MeshMeasure(options.resolution)
+    table = comparison_table(compare_decoders(options, (measure,), progress))
+    what = (
         f"{options.steps} steps of {options.points} points, seeds {list(options.seeds)}; IoU in "
         f"per cent on {options.poses} unseen poses, meshes of {options.measured_poses} of them at "
-        f"resolution {options.resolution}; lengths in 1e-4 m, angles in degrees.",
-        str(value["note"]),
-    ]
-    if "control_hurts" in value:
-        hurts = "hurt" if value["control_hurts"] else "do not hurt: the table says nothing"
-        notes.append(f"Control: shuffled pairs {hurts}.")
-    return ResultTable("Geometry: decoders of the occupancy field", rows, tuple(notes))
-
-
-def _row(row: Mapping[str, Any]) -> dict[str, Cell]:
-    difference = row.get("minus_pair", {}).get("iou")
-    compared = None
-    if difference is not None:
-        mean, low, high = (100 * difference[key] for key in ("mean", "low", "high"))
-        compared = f"{mean:+.2f} [{low:+.2f}, {high:+.2f}]"
-    cells: dict[str, Cell] = {
-        "parameters": row["parameters"],
-        "IoU": round(100 * row["iou"], 2),
-        "in boxes": round(100 * row["iou_boxes"], 2),
-        "near surface": round(100 * row["iou_surface"], 2),
-        "IoU - pair [95 %]": compared,
-        "IoU per 100K": round(row["iou_points_per_100k"], 1),
-    }
-    for name in _MESH_COLUMNS:
-        cells[name] = round(row[name], 3) if math.isfinite(row[name]) else None
-    return cells
+        f"resolution {options.resolution}; lengths in 1e-4 m, angles in degrees."
+    )
+    return replace(table, notes=(what, *table.notes))

@@ -18,7 +18,7 @@ from handavatar.field.shading import OrientedCues, PaperCues
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.rigs import find_rig
-from handavatar.render.silhouette import signed_distance
+from handavatar.render.silhouette import signed_distance, soft_mask
 from handavatar.train.appearance import SeenSamples, appearance_loss, find_seen_samples
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.labelled_poses import sample_points
@@ -428,10 +428,11 @@ def frame_losses(
     device = avatar.device
     pose = corrected_pose(training.corrections, frame, number, device)
     state = avatar.prepare(pose)
-    losses = shape_losses(state.posed, state.offsets, frame, edges, method.silhouette_size)
+    camera = frame.camera.to(device)
+    mask = soft_mask(frame.mask, method.silhouette_size).to(device)
+    losses = shape_losses(state.posed, state.offsets, camera, mask, edges)
     if training.corrections is not None:
         losses["pose"] = 0.01 * training.corrections.penalty(number)
-    camera = frame.camera.to(device)
 
     if step % method.occupancy_every == 0:
         margin = avatar.occupancy.margin

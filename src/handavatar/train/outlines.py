@@ -14,6 +14,7 @@ from handavatar.alignment import aligned_pose
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
 from handavatar.field.shape import personal_hand
+from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import unique_edges
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, Rig
@@ -50,24 +51,26 @@ class EdgeSet:
 
 
 def shape_losses(
-    posed: PosedHand, offsets: Float[Tensor, "vertices 3"], frame: Frame, edges: EdgeSet, size: int
+    posed: PosedHand,
+    offsets: Float[Tensor, "vertices 3"],
+    camera: Camera,
+    mask: Float[Tensor, "size size"],
+    edges: EdgeSet,
 ) -> dict[str, Tensor]:
     """L_shape on a small mask, and what keeps the personal offsets smooth.
 
     Args:
         posed: the personal hand in the frame.
         offsets: of its rest vertices, metres.
-        frame: with mask and camera.
+        camera: of the frame, of any resolution.
+        mask: of the frame, from :func:`~handavatar.render.silhouette.soft_mask`.
         edges: of the same mesh.
-        size: pixels along a side of the compared masks.
 
     Source: paper Sec. 3.1, L_shape.
     """
-    device = posed.vertices.device
-    camera = frame.camera.to(device).resized(size, size)
-    coverage = soft_silhouette(posed.vertices, posed.rig.faces, camera)
+    coverage = soft_silhouette(posed.vertices, posed.rig.faces, camera.resized(*mask.shape))
     return {
-        "silhouette": silhouette_loss(coverage, soft_mask(frame.mask, size).to(device)),
+        "silhouette": silhouette_loss(coverage, mask),
         "offsets": offset_loss(offsets, edges.edges, edges.spacing),
     }
 
@@ -96,6 +99,7 @@ def fit_outlines(
     """
     generator = torch.Generator().manual_seed(seed)
     edges = EdgeSet.of(avatar.base_rig)
+    masks = [soft_mask(frame.mask, size).to(avatar.device) for frame in frames]
     optimizer = torch.optim.Adam(avatar.shape.parameters(), lr=_RATE, betas=(0.9, 0.99))
     passes = rounds * visits + (rounds + 1 if corrections else 0) * (rounds > 0)
     steps = rounds * visits * -(-len(frames) // _BATCH)
@@ -110,7 +114,15 @@ def fit_outlines(
                 for chosen in order.split(_BATCH):
                     optimizer.zero_grad()
                     values = [
-                        _backward(avatar, corrections, frames, number, edges, size, len(chosen))
+                        _backward(
+                            avatar,
+                            corrections,
+                            frames[number],
+                            masks[number],
+                            number,
+                            edges,
+                            len(chosen),
+                        )
                         for number in chosen.tolist()
                     ]
                     optimizer.step()
@@ -157,18 +169,18 @@ def _align(
 def _backward(
     avatar: HandAvatar,
     corrections: PoseCorrections | None,
-    frames: list[Frame],
+    frame: Frame,
+    mask: Float[Tensor, "size size"],
     number: int,
     edges: EdgeSet,
-    size: int,
     share: int,
 ) -> float:
     """Adds one frame's gradient to that of the shape; returns its silhouette loss."""
-    frame = frames[number]
     with torch.no_grad():
         pose = corrected_pose(corrections, frame, number, avatar.device)
     rest = avatar.base_rig.shaped(avatar.coefficients)
     offsets = avatar.shape(rest, pose.rotations)
-    losses = shape_losses(personal_hand(rest, offsets).posed(pose), offsets, frame, edges, size)
+    camera = frame.camera.to(avatar.device)
+    losses = shape_losses(personal_hand(rest, offsets).posed(pose), offsets, camera, mask, edges)
     (torch.stack(list(losses.values())).sum() / share).backward()
     return float(losses["silhouette"].detach())

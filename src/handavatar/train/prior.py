@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from handavatar.avatar import CheckpointError
-from handavatar.evaluate.geometry import intersection_over_union
+from handavatar.evaluate.metrics import mask_iou
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
 from handavatar.hand.detail import subdivided
 from handavatar.hand.open_hand import Level, load_open_hand
@@ -348,7 +348,7 @@ def pose_scores(
         half = len(sample.points) // 2
         scores.append(
             [
-                intersection_over_union(predicted[window], sample.is_inside[window])
+                mask_iou(predicted[window], sample.is_inside[window])
                 for window in (slice(0, half), slice(half, None))
             ]
         )

@@ -16,11 +16,11 @@ from handavatar.evaluate.geometry import (
     Truth,
     chamfer,
     contact_errors,
-    intersection_over_union,
     roughness,
     seams,
 )
 from handavatar.evaluate.intervals import mean_interval
+from handavatar.evaluate.metrics import mask_iou
 from handavatar.field.decoders import OccupancyField
 from handavatar.geometry.extraction import Field, num_components
 from handavatar.hand.detail import subdivided
@@ -187,7 +187,7 @@ def measure_field(
     predicted, inside = occupancy_of(points) > 0.5, truth.contains(points)
     half = len(points) // 2
     ious = [
-        intersection_over_union(predicted[window], inside[window])
+        mask_iou(predicted[window], inside[window])
         for window in (slice(0, half), slice(half, None))
     ]
     distance = chamfer(surface.vertices, surface.faces, truth)
@@ -214,37 +214,23 @@ def measure_field(
     )
 
 
-@dataclass(frozen=True)
-class MeshOptions:
-    """Meshes that ``prior evaluate`` extracts beside its points.
-
-    Attributes:
-        meshes: from so many unseen poses, and as many fists; 0 extracts none.
-        resolution: cells along the longest side of the extraction's box.
-    """
-
-    meshes: int = 0
-    resolution: int = 128
-
-
 def measure_prior_file(
-    prior: Path, level: Level, rounds: int, options: MeshOptions
+    prior: Path, level: Level, rounds: int, count: int, resolution: int
 ) -> dict[str, dict[str, dict[str, float | int | None]]]:
-    """Every column on unseen poses and on fists, summarised; none where no mesh is asked for.
+    """Every column on unseen poses (``unseen``) and on fists (``fists``), summarised.
 
     Args:
         prior: file of the weights.
         level: which open hand.
         rounds: midpoint subdivisions of the mesh that guides.
-        options: how many, how finely.
+        count: of the unseen poses, and of the fists.
+        resolution: cells along the longest side of the extraction's box.
     """
-    if options.meshes < 1:
-        return {}
     field = open_prior(prior)
     base = load_open_hand(level)
     rig = subdivided(base, rounds)
     return {
-        name: summarised(measure_prior(field, hands(rig, base, options.meshes), options.resolution))
+        name: summarised(measure_prior(field, hands(rig, base, count), resolution))
         for name, hands in (("unseen", unseen_hands), ("fists", unseen_fists))
     }
 
