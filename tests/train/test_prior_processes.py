@@ -24,15 +24,34 @@ from handavatar.train.stage_times import StageTimes
 from handavatar.train.stopping import Interrupted
 
 WORDS = ["prior", "train", "--points", "64", "--level", "778", "--rounds", "0", "--poses", "2"]
+PROGRAM = ["-m", "handavatar"]
+STOPPED_PROGRAM = [
+    "-c",
+    """
+import os, signal, sys
+from handavatar import cli
+from handavatar.train.labelled_poses import PoseStream
+
+drawn = PoseStream.drawn
+
+def interrupted(stream, number, times):
+    if number == 1:  # Amid step 1, and only in the second process.
+        os.kill(os.getpid(), signal.SIGTERM)
+    return drawn(stream, number, times)
+
+PoseStream.drawn = interrupted
+sys.exit(cli.main(sys.argv[1:]))
+""",
+]
 
 
 def _options(out: Path, steps: int) -> PriorOptions:
     return PriorOptions(out, steps=steps, points=64, poses=2, level="778", rounds=0)
 
 
-def _begun(words: list[str], **environment: str) -> subprocess.Popen[str]:
+def _begun(program: list[str], words: list[str], **environment: str) -> subprocess.Popen[str]:
     return subprocess.Popen(
-        [sys.executable, "-m", "handavatar", *words],
+        [sys.executable, *program, *words],
         stderr=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -40,13 +59,14 @@ def _begun(words: list[str], **environment: str) -> subprocess.Popen[str]:
     )
 
 
-def _two_begun(words: list[str]) -> list[subprocess.Popen[str]]:
+def _two_begun(words: list[str], program: list[str] = PROGRAM) -> list[subprocess.Popen[str]]:
     """What torchrun sets, without its agent, which takes seconds to start."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     return [
         _begun(
+            program,
             words,
             RANK=str(rank),
             LOCAL_RANK=str(rank),
@@ -67,23 +87,51 @@ def _ended(processes: list[subprocess.Popen[str]]) -> tuple[list[int], str]:
     return [process.returncode for process in processes], "\n".join(texts)
 
 
-def test_two_processes_learn_what_one_learns_stop_together_and_continue(tmp_path: Path) -> None:
-    one = load_file(tmp_path / "one") if train_prior(_options(tmp_path / "one", 3)) else {}
-    words = [*WORDS, "--out", str(tmp_path / "two"), "--folder", str(tmp_path / "run")]
+@pytest.fixture(scope="module")
+def two_processes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What two processes left, undisturbed: the weights ``two`` and the folder ``run``."""
+    folder = tmp_path_factory.mktemp("two")
+    words = [*WORDS, "--out", str(folder / "two"), "--folder", str(folder / "run")]
     codes, text = _ended(_two_begun([*words, "--steps", "3"]))
     assert codes == [0, 0], text
-    two = load_file(tmp_path / "two")
+    return folder
+
+
+def _log(folder: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+
+
+def test_two_processes_learn_what_one_learns(tmp_path: Path, two_processes: Path) -> None:
+    train_prior(_options(tmp_path / "one", 3))
+    one, two = load_file(tmp_path / "one"), load_file(two_processes / "two")
     # The same hands, the mean of two gradients summed in another order: float rounding (6e-8 of
     # a gradient), which Adam can blow up to a step of the learning rate, 1e-3, where a gradient
     # is nothing but rounding. Hence nearly all weights agree to 1e-6, none differs by three steps.
     difference = torch.cat([(two[name] - one[name]).abs().flatten() for name in one])
     assert float((difference < 1e-6).float().mean()) > 0.999
     assert float(difference.max()) < 3e-3
-    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    log = _log(two_processes / "run")
     assert [line["step"] for line in log] == [3]
     assert log[0]["samples_per_second"] > 0
     shares = [value for name, value in log[0].items() if name.startswith("share_")]
     assert sum(shares) == pytest.approx(1)
+
+
+def test_two_processes_stop_together_and_continue_bit_for_bit(
+    tmp_path: Path, two_processes: Path
+) -> None:
+    words = [*WORDS, "--out", str(tmp_path / "two"), "--folder", str(tmp_path / "run")]
+    codes, text = _ended(_two_begun([*words, "--steps", "3"], STOPPED_PROGRAM))
+    assert codes == [130, 130], text
+    assert text.count("stopped at step 1; continue with --folder") == 2
+    # Two steps more: what the second process keeps of the optimisers shows in the first one's
+    # weights only by the gradient of a later step.
+    codes, text = _ended(_two_begun([*words, "--steps", "3"]))
+    assert codes == [0, 0], text
+    assert [line["step"] for line in _log(tmp_path / "run")] == [1, 3]
+    # Equal bits: a sum of two gradients has only one order. That of three may be rounded otherwise.
+    resumed, whole = load_file(tmp_path / "two"), load_file(two_processes / "two")
+    assert all(torch.equal(resumed[name], whole[name]) for name in whole)
 
 
 def test_processes_that_cannot_share_evenly_are_refused(
@@ -114,8 +162,7 @@ def test_a_stopped_training_continues_bit_for_bit(
     (tmp_path / "run" / "log.jsonl").open("a").write(json.dumps({"step": 4}) + "\n")
     resumed = train_prior(options).state_dict()
     assert all(torch.equal(resumed[name], whole[name]) for name in whole)
-    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in log] == [3, 5]
+    assert [line["step"] for line in _log(tmp_path / "run")] == [3, 5]
     saved = load_file(tmp_path / "b")
     assert all(torch.equal(saved[name], whole[name]) for name in whole)
 
