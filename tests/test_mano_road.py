@@ -9,15 +9,18 @@ import torch
 from conftest import TINY, camera_above, write_tiny_capture
 from mano_files import write_mano
 from safetensors import safe_open
+from safetensors.torch import load_file
 
 from handavatar import cli
 from handavatar.avatar import HandAvatar, RenderSettings
 from handavatar.capture.fitted_hand import HandFit, HandModel
 from handavatar.capture.frames import read_capture
+from handavatar.field.decoders import untrained_field
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.rig import LicensedRigMissing
 from handavatar.hand.rigs import load_rig
 from handavatar.train.loop import METHODS, TrainOptions, train
+from handavatar.train.prior_pictures import POSES
 
 FEW = RenderSettings(num_samples=12)
 
@@ -75,6 +78,51 @@ def test_import_capture_train_save_load_render(
         assert cli.main(words) == 4
         captured = capsys.readouterr()
         assert captured.out == "" and "handavatar rig import-mano" in captured.err
+
+
+def test_a_prior_learns_on_it_is_judged_and_pictured(
+    home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mano = write_mano(tmp_path / "MANO_RIGHT.pkl")
+    assert cli.main(["rig", "import-mano", str(mano), "--json"]) == 0
+    imported = json.loads(capsys.readouterr().out)
+    out, folder = tmp_path / "prior.safetensors", tmp_path / "run"
+    train_words = ["prior", "train", "--out", str(out), "--folder", str(folder), "--rounds", "0"]
+    train_words += ["--steps", "2", "--points", "64", "--rig"]
+    assert cli.main([*train_words, "mano-right"]) == 0
+    assert f"--prior {out} --rig mano-right" in capsys.readouterr().out
+
+    # Weights, and which rig; nothing of the rig, nor where it lies.
+    with safe_open(out, framework="pt") as stored:
+        facts, names = stored.metadata(), set(stored.keys())
+    assert (facts["rig"], facts["rig_sha256"]) == ("mano-right", imported["sha256"])
+    assert json.loads(facts["options"])["rig"] == f"mano-right ({imported['sha256'][:12]})"
+    assert names == set(untrained_field("pair").state_dict())
+    states = list(folder.glob("checkpoints/*/*.safetensors"))
+    assert {path.stem for path in states} == {"model", "muon", "adam"}
+    for path in [out, *states]:
+        sizes = {size for value in load_file(path).values() for size in value.shape}
+        assert 778 not in sizes and 1538 not in sizes, path
+
+    # The file of the same rig continues the run; another rig does not.
+    assert cli.main([*train_words, imported["file"]]) == 0
+    assert str(home) not in (folder / "options.json").read_text()
+    assert str(home) not in str(safe_open(out, framework="pt").metadata())
+    assert cli.main([*train_words, "open-hand-778"]) == 3
+    assert "other options: rig" in capsys.readouterr().err
+
+    words = ["prior", "evaluate", "--prior", str(out), "--poses", "1", "--points", "64"]
+    words += ["--rounds", "0", "--rig", "mano-right", "--json"]
+    assert cli.main(words) == 0
+    assert 0 <= json.loads(capsys.readouterr().out)["iou"] <= 1
+    assert cli.main([*words, "--level", "778"]) == 3
+    assert "found level 778, which the open hand alone has" in capsys.readouterr().err
+    words = ["prior", "picture", "--resolution", "16", "--size", "16", "--rounds", "0"]
+    assert cli.main([*words, "--rig", "mano-right", "--out", str(tmp_path / "pictures")]) == 0
+    assert len(list((tmp_path / "pictures").iterdir())) == len(POSES)
+    for command in ("train", "evaluate"):
+        assert cli.main(["prior", command, "--rig", "mano-left"]) == 4
+        assert "handavatar rig import-mano" in capsys.readouterr().err
 
 
 def test_a_missing_file_is_exit_4_and_a_hostile_one_exit_3(

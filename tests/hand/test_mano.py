@@ -91,7 +91,24 @@ def test_what_is_derived_fits_the_hand(right: ManoModel) -> None:
     # Back and palm do not share a place on the chart.
     halves = (rig.uv_coordinates[rig.uv_faces][..., 0] > 0.5).float().mean(-1)
     assert set(halves.tolist()) == {0.0, 1.0}
-    assert len(divide_into_parts(rig).corner_indices) == NUM_BONES
+
+
+def test_its_parts_are_those_of_the_hand_it_was_made_of(tmp_path: Path) -> None:
+    like, pose = load_open_hand("778"), HandPose(_random_pose(1).rotations[0], torch.zeros(3))
+    none = np.zeros((778, 3, 135))
+    rig = read_mano(write_mano(tmp_path / "MANO_RIGHT.pkl", posedirs=none)).rig
+    parts, own = divide_into_parts(rig), divide_into_parts(like)
+    assert torch.equal(parts.vertex_labels.bincount(), own.vertex_labels.bincount())
+    boxes = parts.boxes(rig.shaped().posed(pose), 0.01)
+    expected = own.boxes(like.shaped().posed(pose), 0.01)
+    # In the frames of the bones; in the world the wrist lies elsewhere.
+    for name in ("lower", "upper", "cut_normal"):
+        torch.testing.assert_close(
+            getattr(boxes, name), getattr(expected, name), atol=1e-5, rtol=0, msg=name
+        )
+    clouds = parts.point_clouds(rig.shaped().posed(pose))
+    assert bool((clouds[..., :3] > boxes.lower[:, None] - 0.03).all())
+    assert bool((clouds[..., :3] < boxes.upper[:, None] + 0.03).all())
 
 
 # --- the paper's counts, and pose blend shapes ----------------------------------------------------

@@ -1,12 +1,16 @@
 """Joint limits, the sampler, penetration, gestures and motion."""
 
 import math
+from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import pytest
 import torch
+from mano_files import write_mano
 
 from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.hand.mano import read_mano
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import BONE_NAMES, FINGER_BONES, HandPose
 from handavatar.hand.pose_sampling import (
@@ -164,6 +168,25 @@ def test_gestures_do_not_overlap(level: Literal["full", "778"]) -> None:
     rotations = torch.stack([gesture_rotations(rig, name) for name in GESTURES])
     depths = dict(zip(GESTURES, PenetrationProbe(rig).depths(rotations).tolist(), strict=True))
     assert {name: depth for name, depth in depths.items() if depth > PENETRATION_LIMIT} == {}
+
+
+def test_an_imported_rig_is_sampled_and_opened_like_the_open_hand(
+    tmp_path: Path, rig: Rig, sampled: torch.Tensor
+) -> None:
+    none = np.zeros((778, 3, 135))  # The tests' own pose blend shapes are noise: no hand's.
+    mano = read_mano(write_mano(tmp_path / "MANO_RIGHT.pkl", posedirs=none)).rig
+    poses = sample_poses(mano, 40, torch.Generator().manual_seed(3))
+    assert float(limit_excess(mano, poses).max()) < ANGLE_TOLERANCE
+    # The same angles, though about axes of its own.
+    torch.testing.assert_close(
+        angles_from_rotations(mano, poses),
+        angles_from_rotations(rig, sampled),
+        atol=ANGLE_TOLERANCE,
+        rtol=0,
+    )
+    depths = PenetrationProbe(mano).depths
+    assert float(depths(poses).max()) > PENETRATION_LIMIT, "the test needs poses that overlap"
+    assert float(depths(resolve_penetration(mano, poses)).max()) <= PENETRATION_LIMIT
 
 
 @pytest.mark.parametrize("name", sorted(GESTURES))

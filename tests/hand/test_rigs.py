@@ -54,6 +54,17 @@ def test_rigs_are_found_by_name_file_and_fingerprint(model: ManoModel, home: Pat
     assert load_rig("mano-right").name == "mano-right"
 
 
+def test_the_open_hand_alone_has_levels(model: ManoModel, home: Path) -> None:
+    path = save_rig(model)
+    small = load_open_hand("778").sha256
+    for reference in ("open-hand", "open-hand-778"):
+        assert load_rig(reference, "778").sha256 == small
+    assert load_rig("mano-right", "full").sha256 == model.rig.sha256
+    for reference in ("mano-right", str(path)):
+        with pytest.raises(RigError, match=r"found level 778, which the open hand[\s\S]*--level"):
+            load_rig(reference, "778")
+
+
 def test_a_missing_rig_says_where_to_get_it(home: Path, tmp_path: Path) -> None:
     for reference in ("mano-right", str(tmp_path / "mano.safetensors")):
         with pytest.raises(LicensedRigMissing, match=r"mano.is.tue.mpg.de[\s\S]*import-mano"):

@@ -83,7 +83,7 @@ def test_prior_evaluate_extracts_meshes_only_if_asked(capsys: pytest.CaptureFixt
 
 
 def test_a_prior_file_is_measured_on_unseen_poses_and_fists() -> None:
-    found = measure_prior_file(SHIPPED_PRIOR, "778", 0, count=1, resolution=16)
+    found = measure_prior_file(SHIPPED_PRIOR, load_open_hand("778"), 0, count=1, resolution=16)
     assert set(found) == {"unseen", "fists"}
     assert found["fists"]["contact_error"]["count"] == 1
     assert all(columns["cham"]["mean"] > 0 for columns in found.values())

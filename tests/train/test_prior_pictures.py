@@ -13,7 +13,7 @@ def test_each_pose_becomes_a_picture_of_all_priors_from_four_sides(tmp_path: Pat
     copy = tmp_path / "other.safetensors"
     copy.write_bytes(SHIPPED_PRIOR.read_bytes())
     options = PriorPictureOptions(
-        tmp_path / "pictures", (SHIPPED_PRIOR, copy), 16, 32, "778", 0, truth=False
+        tmp_path / "pictures", (SHIPPED_PRIOR, copy), 16, 32, level="778", rounds=0, truth=False
     )
     written = picture_priors(options)
     assert [path.stem for path in written] == list(POSES)

@@ -25,13 +25,15 @@ def train(words: list[str]) -> int:
         shares = [(share, name[6:]) for name, share in latest.items() if name.startswith("share_")]
         listed = ", ".join(f"{name} {share:.0%}" for share, name in sorted(shares, reverse=True))
         print(f"speed: {latest['samples_per_second']:,.0f} labelled points/s; {listed}")
-    print(f"next: handavatar prior evaluate --prior {options.out}")
+    rig = "" if options.rig == "open-hand" else f" --rig {options.rig}"
+    print(f"next: handavatar prior evaluate --prior {options.out}{rig}")
     return 0
 
 
 def evaluate(words: list[str]) -> int:
     """How well a prior knows inside from outside, on unseen poses and shapes."""
     from handavatar.cli.arguments import JSON, Extra, parse_with, print_figures, print_json
+    from handavatar.hand.rigs import load_rig
     from handavatar.train.prior import PriorEvaluationOptions, evaluate_prior
     from handavatar.train.prior_measures import measure_prior_file
 
@@ -43,8 +45,9 @@ def evaluate(words: list[str]) -> int:
     options, extras = parse_with(PriorEvaluationOptions, extras_wanted, words, "prior evaluate")
     figures: dict[str, object] = {**evaluate_prior(options)}
     if extras["meshes"] > 0:
+        base = load_rig(options.rig, options.level)
         figures |= measure_prior_file(
-            options.prior, options.level, options.rounds, extras["meshes"], extras["resolution"]
+            options.prior, base, options.rounds, extras["meshes"], extras["resolution"]
         )
     (print_json if extras["json"] else print_figures)(figures)
     return 0

@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from safetensors import torch as safetensors_torch
 
 from handavatar.hand.mano import LICENCE, WHERE_TO_GET_IT, ManoModel
-from handavatar.hand.open_hand import load_open_hand
+from handavatar.hand.open_hand import Level, load_open_hand
 from handavatar.hand.rig import RIG_ARRAYS, LicensedRigMissing, Rig, RigError
 
 SCHEMA = 1
@@ -101,21 +101,28 @@ def read_rig(path: Path) -> Rig:
     return rig
 
 
-def load_rig(reference: str) -> Rig:
+def load_rig(reference: str, level: Level = "full") -> Rig:
     """A rig by what a user calls it.
 
     Args:
         reference: ``open-hand``, ``open-hand-778``, the name of an imported rig such as
             ``mano-right``, or the path of a file that ``handavatar rig import-mano`` wrote.
+        level: ``full`` is the rig as it is, ``778`` the open hand thinned to MANO's size; no
+            other rig can be thinned.
 
     Raises:
         LicensedRigMissing: it is a MANO rig that was not imported.
-        RigError: it is unknown, ambiguous or damaged.
+        RigError: it is unknown, ambiguous or damaged, or has no such level.
     """
     if reference == "open-hand":
-        return load_open_hand()
+        return load_open_hand(level)
     if reference == "open-hand-778":
         return load_open_hand("778")
+    if level != "full":
+        raise RigError(
+            f"rig {reference[:80]}: found level {level}, which the open hand alone has\n"
+            "leave out --level: other rigs are used as they are"
+        )
     path = Path(reference)
     if path.suffix == ".pkl":
         raise RigError(f"{path}: not yet a rig\nimport it: handavatar rig import-mano {path}")

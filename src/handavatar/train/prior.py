@@ -27,9 +27,11 @@ from handavatar.avatar import CheckpointError
 from handavatar.evaluate.metrics import mask_iou
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
 from handavatar.hand.detail import subdivided
-from handavatar.hand.open_hand import Level, load_open_hand
+from handavatar.hand.open_hand import Level
 from handavatar.hand.parts import Parts, divide_into_parts
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
+from handavatar.hand.rig import Rig
+from handavatar.hand.rigs import load_rig
 from handavatar.train.labelled_poses import LabelledPose, PoseStream, labelled_pose
 from handavatar.train.pretraining import (
     OccupancyLoss,
@@ -69,7 +71,8 @@ class PriorOptions:
         points: labelled points per pose.
         lr: the highest learning rate, soon after the start.
         final_lr: learning rate at the end; half a cosine in between.
-        level: which open hand.
+        rig: the hand: ``open-hand``, an imported one (``mano-right``) or its file.
+        level: ``778`` thins the open hand to MANO's size; other rigs have ``full`` alone.
         rounds: midpoint subdivisions of the mesh that is encoded and labelled.
         seed: of everything.
         start_from: a prior to continue from.
@@ -87,6 +90,7 @@ class PriorOptions:
     points: int = 1024
     lr: float = 1e-3
     final_lr: float = 5e-5
+    rig: str = "open-hand"
     level: Level = "full"
     rounds: int = 1
     seed: int = 0
@@ -114,8 +118,10 @@ def train_prior(
     Raises:
         CheckpointError: if ``folder`` holds something else than a run with these options.
         Interrupted: after SIGINT or SIGTERM; a checkpoint was saved if there is a ``folder``.
+        RigError: if there is no such rig, or not at this level.
         ValueError: if the processes cannot share the poses of a step evenly.
     """
+    base = load_rig(options.rig, options.level)
     with joined_processes(options.device) as processes, stop_signals() as stopped:
         if options.poses % processes.count:
             raise ValueError(
@@ -125,13 +131,14 @@ def train_prior(
         with ExitStack() as held:
             run = None
             if options.folder is not None and processes.is_first:
-                run = begin_prior_run(options.folder, _what_to_learn(options))
+                run = begin_prior_run(options.folder, _what_to_learn(options, base))
                 held.enter_context(locked(run))
-            return _trained(options, processes, run, stopped, report)
+            return _trained(options, base, processes, run, stopped, report)
 
 
 def _trained(
     options: PriorOptions,
+    base: Rig,
     processes: Processes,
     run: Run | None,
     stopped: Callable[[], bool],
@@ -152,7 +159,6 @@ def _trained(
         processes.wait()
         if not processes.is_first:
             done, average = load_progress(Run(options.folder), field, optimizers)
-    base = load_open_hand(options.level)
     rig = subdivided(base, options.rounds)
     parts = divide_into_parts(rig)
     stream = PoseStream(base, rig, parts, field.margin, options.points, options.seed)
@@ -189,7 +195,7 @@ def _trained(
             if run is not None:
                 append_log(run, step, figures)
         if processes.is_first and (step % options.checkpoint_every == 0 or is_last):
-            save_prior(field, options, step)
+            save_prior(field, options, base, step)
             if run is not None:
                 save_progress(run, step, field, optimizers, average)
         if is_stopped and step < options.steps:
@@ -202,17 +208,20 @@ def _trained(
     return field
 
 
-def _what_to_learn(options: PriorOptions) -> dict[str, Any]:
-    """The options on which the weights depend, as JSON."""
+def _what_to_learn(options: PriorOptions, rig: Rig) -> dict[str, Any]:
+    """The options on which the weights depend, as JSON; the rig as it is known anywhere."""
     elsewhere = ("out", "folder", "checkpoint_every", "device")
     record = {name: value for name, value in asdict(options).items() if name not in elsewhere}
-    return {**record, "start_from": None if options.start_from is None else str(options.start_from)}
+    start = None if options.start_from is None else str(options.start_from)
+    return {**record, "rig": f"{rig.name} ({rig.sha256[:12]})", "start_from": start}
 
 
-def save_prior(field: OccupancyField, options: PriorOptions, step: int) -> None:
-    """Writes the weights aside and renames them into place."""
-    rig = load_open_hand(options.level)
-    record = {**_what_to_learn(options), "out": options.out.name}
+def save_prior(field: OccupancyField, options: PriorOptions, rig: Rig, step: int) -> None:
+    """Writes the weights aside and renames them into place.
+
+    Of the rig, whose arrays may be licensed, the file holds only name and fingerprint.
+    """
+    record = {**_what_to_learn(options, rig), "out": options.out.name}
     metadata = {
         "schema": "1",
         "rig": rig.name,
@@ -294,13 +303,15 @@ class PriorEvaluationOptions:
         prior: the weights; by default those that ship.
         poses: unseen poses of unseen shapes.
         points: labelled points per pose, half in the part boxes, half near the surface.
-        level: which open hand.
+        rig: the hand: ``open-hand``, an imported one (``mano-right``) or its file.
+        level: ``778`` thins the open hand to MANO's size; other rigs have ``full`` alone.
         rounds: midpoint subdivisions.
     """
 
     prior: Path = SHIPPED_PRIOR
     poses: int = 50
     points: int = 4096
+    rig: str = "open-hand"
     level: Level = "full"
     rounds: int = 1
 
@@ -327,7 +338,7 @@ def evaluation_poses(
         options: how many; ``prior`` plays no part.
         margin: of the part boxes, metres.
     """
-    base = load_open_hand(options.level)
+    base = load_rig(options.rig, options.level)
     rig = subdivided(base, options.rounds)
     parts = divide_into_parts(rig)
     generator = torch.Generator().manual_seed(EVALUATION_SEED)

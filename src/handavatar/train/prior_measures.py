@@ -24,7 +24,6 @@ from handavatar.evaluate.metrics import mask_iou
 from handavatar.field.decoders import OccupancyField
 from handavatar.geometry.extraction import Field, num_components
 from handavatar.hand.detail import subdivided
-from handavatar.hand.open_hand import Level, load_open_hand
 from handavatar.hand.parts import PartBoxes, divide_into_parts
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations, resolve_penetration, sample_poses
@@ -215,19 +214,18 @@ def measure_field(
 
 
 def measure_prior_file(
-    prior: Path, level: Level, rounds: int, count: int, resolution: int
+    prior: Path, base: Rig, rounds: int, count: int, resolution: int
 ) -> dict[str, dict[str, dict[str, float | int | None]]]:
     """Every column on unseen poses (``unseen``) and on fists (``fists``), summarised.
 
     Args:
         prior: file of the weights.
-        level: which open hand.
+        base: the hand before subdivision.
         rounds: midpoint subdivisions of the mesh that guides.
         count: of the unseen poses, and of the fists.
         resolution: cells along the longest side of the extraction's box.
     """
     field = open_prior(prior)
-    base = load_open_hand(level)
     rig = subdivided(base, rounds)
     return {
         name: summarised(measure_prior(field, hands(rig, base, count), resolution))

@@ -15,11 +15,12 @@ from handavatar.field.decoders import OccupancyField
 from handavatar.geometry.cameras import Camera, look_at
 from handavatar.geometry.extraction import Field
 from handavatar.hand.detail import subdivided
-from handavatar.hand.open_hand import Level, load_open_hand
+from handavatar.hand.open_hand import Level
 from handavatar.hand.parts import divide_into_parts
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
+from handavatar.hand.rigs import load_rig
 from handavatar.hand.surface import extract_hand
 from handavatar.render.shaded import shaded_mesh
 from handavatar.train.prior import SHIPPED_PRIOR, open_prior
@@ -49,7 +50,8 @@ class PriorPictureOptions:
         priors: the weights; by default those that ship.
         resolution: cells along the longest side of the extraction's box.
         size: edge of one picture, pixels.
-        level: which open hand.
+        rig: the hand: ``open-hand``, an imported one (``mano-right``) or its file.
+        level: ``778`` thins the open hand to MANO's size; other rigs have ``full`` alone.
         rounds: midpoint subdivisions.
         truth: adds a row of the guiding mesh, extracted in the same way.
     """
@@ -58,6 +60,7 @@ class PriorPictureOptions:
     priors: tuple[Path, ...] = (SHIPPED_PRIOR,)
     resolution: int = 256
     size: int = 320
+    rig: str = "open-hand"
     level: Level = "full"
     rounds: int = 1
     truth: bool = True
@@ -68,8 +71,9 @@ def picture_priors(options: PriorPictureOptions) -> list[Path]:
 
     Raises:
         CheckpointError: if a prior cannot be read.
+        RigError: if there is no such rig, or not at this level.
     """
-    base = load_open_hand(options.level)
+    base = load_rig(options.rig, options.level)
     rig = subdivided(base, options.rounds)
     parts, skin = divide_into_parts(rig), Skin.of(rig)
     fields: dict[str, FieldOf] = {}
