@@ -9,7 +9,7 @@ import pytest
 import torch
 from mano_files import write_mano
 
-from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.mano import read_mano
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import BONE_NAMES, FINGER_BONES, HandPose
@@ -118,6 +118,18 @@ def test_clamped_angles_are_inside_and_leave_the_inside_alone(rig: Rig) -> None:
     inside[:, 0] = 0
     excess = limit_excess(rig, rotations_from_angles(rig, inside))
     assert float(excess.max()) < ANGLE_TOLERANCE
+
+
+def test_a_hand_held_upright_has_a_gradient(rig: Rig) -> None:
+    """Its wrist is turned by a right angle of abduction, where flexion and twist are one."""
+    upright = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    rotations = torch.zeros(16, 3)
+    rotations[0] = axis_angle_from_matrix(upright)
+    rotations.requires_grad_()
+    angles = angles_from_rotations(rig, rotations)
+    assert abs(math.degrees(float(angles[0, 1].detach()))) == pytest.approx(90, abs=0.1)
+    (gradient,) = torch.autograd.grad(angles.square().sum(), rotations)
+    assert bool(gradient.isfinite().all())
 
 
 def test_samples_are_inside_the_limits_repeatable_and_varied(

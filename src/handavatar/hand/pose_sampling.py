@@ -79,7 +79,9 @@ def angles_from_rotations(
     """
     axes = rig.joint_axes.to(rotations)
     m = axes @ matrix_from_axis_angle(rotations) @ axes.transpose(-1, -2)
-    abduction = torch.atan2(m[..., 0, 2], (m[..., 0, 0].square() + m[..., 0, 1].square()).sqrt())
+    # At a right angle of abduction, as of the wrist of an upright hand, the root has no gradient.
+    squared = m[..., 0, 0].square() + m[..., 0, 1].square()
+    abduction = torch.atan2(m[..., 0, 2], squared.clamp_min(torch.finfo(m.dtype).tiny).sqrt())
     flexion = torch.atan2(-m[..., 1, 2], m[..., 2, 2])
     twist = torch.atan2(-m[..., 0, 1], m[..., 0, 0])
     return torch.stack([flexion, abduction, twist], dim=-1)
