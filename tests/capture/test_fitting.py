@@ -1,11 +1,13 @@
 """Known poses come back from what a camera would see of them."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
+from mano_files import write_mano
 from torch import Tensor
 
 from handavatar.capture.fitted_hand import HandFit, HandModel, projected
@@ -27,8 +29,9 @@ from handavatar.capture.outlines import (
 from handavatar.capture.tracking import LANDMARK_NAMES
 from handavatar.capture.windows import Window, window_camera
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from handavatar.hand.mano import read_mano
 from handavatar.hand.open_hand import load_open_hand
-from handavatar.hand.pose import HandPose
+from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import gesture_rotations, interpolate_rotations
 from handavatar.hand.rig import Rig
 
@@ -105,6 +108,69 @@ def test_single_vertices_equal_the_rig_s(rig: Rig, truth: HandFit) -> None:
     picked = expected.gather(1, chosen[..., None].expand(-1, -1, 3))
     assert torch.allclose(model.vertices(truth, chosen), picked, atol=1e-5)
     assert torch.allclose(model.all_vertices(truth), expected, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def blended_rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
+    """MANO's layout, with pose blend shapes that move every vertex by millimetres.
+
+    The fingertips hang on their last bones alone, as landmarks are taken to.
+    """
+    rig = read_mano(write_mano(tmp_path_factory.mktemp("mano") / "MANO_RIGHT.pkl")).rig
+    weights, tips = rig.skin_weights.clone(), rig.vertex_sets["fingertips"]
+    weights[tips] = torch.eye(NUM_BONES)[weights[tips].argmax(1)]
+    return replace(rig, skin_weights=weights)
+
+
+def _any_fit(rig: Rig, frames: int, seed: int) -> HandFit:
+    """Any shape in any poses; rotations and shape ask for gradients."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = torch.randn(rig.shape_directions.shape[-1], generator=generator)
+    rotations = 0.6 * torch.randn(frames, NUM_BONES, 3, generator=generator)
+    return HandFit(
+        rotations.requires_grad_(),
+        torch.randn(frames, 3, generator=generator),
+        shape.requires_grad_(),
+        torch.tensor(math.log(FOCAL)),
+        torch.zeros(21, 3),
+    )
+
+
+def test_pose_blend_shapes_move_landmarks_and_vertices_as_they_move_the_rig(
+    blended_rig: Rig,
+) -> None:
+    rig, model = blended_rig, HandModel(blended_rig)
+    plain = HandModel(replace(rig, pose_directions=torch.zeros(778, 3, 0)))
+    tips = rig.vertex_sets["fingertips"]
+    is_tip = torch.tensor([name.endswith("_tip") for name in LANDMARK_NAMES])
+    for seed in range(3):
+        fit = _any_fit(rig, FRAMES, seed)
+        generator = torch.Generator().manual_seed(seed)
+        chosen = torch.randint(rig.num_vertices, (FRAMES, 50), generator=generator)
+        hand = rig.shaped(fit.shape_coefficients).posed(HandPose(fit.rotations, fit.translation))
+        pairs = {
+            "tips": (model.landmarks(fit)[:, is_tip], hand.vertices[:, tips]),
+            "joints": (model.landmarks(fit)[:, 1:4], hand.joints[:, 13:16]),
+            "vertices": (
+                model.vertices(fit, chosen),
+                hand.vertices.gather(1, chosen[..., None].expand(-1, -1, 3)),
+            ),
+        }
+        # The fit learns by gradients: they must be the rig's too.
+        learned = [fit.rotations, fit.shape_coefficients]
+        for name, (found, expected) in pairs.items():
+            torch.testing.assert_close(found, expected, atol=2e-6, rtol=0, msg=name)
+            weights = torch.randn(found.shape, generator=generator)
+            torch.testing.assert_close(
+                torch.autograd.grad((found * weights).sum(), learned, retain_graph=True),
+                torch.autograd.grad((expected * weights).sum(), learned, retain_graph=True),
+                atol=2e-5,
+                rtol=1e-4,
+                msg=name,
+            )
+        torch.testing.assert_close(model.all_vertices(fit), hand.vertices, atol=2e-6, rtol=0)
+        moved = (model.landmarks(fit) - plain.landmarks(fit)).detach().norm(dim=-1)
+        assert float(moved[:, ~is_tip].max()) == 0 and float(moved[:, is_tip].max()) > 3e-3
 
 
 def test_placing_is_exact_for_a_known_pose(rig: Rig, truth: HandFit) -> None:

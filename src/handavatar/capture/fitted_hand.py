@@ -73,6 +73,7 @@ class HandModel:
             bones += [*chain, chain[-1]]
             rows += [*chain, NUM_BONES + _FINGERS.index(finger)]
         self.landmark_bones = torch.tensor(bones)
+        self._tip_landmarks = (torch.tensor(rows) >= NUM_BONES).nonzero()[:, 0]
         joint_directions = torch.einsum("bv,vcs->bcs", rig.joint_regressor, rig.shape_directions)
         points = torch.cat(
             [rig.joint_regressor @ rig.template_vertices, rig.template_vertices[tips]]
@@ -90,13 +91,14 @@ class HandModel:
         return self._joints + self._joint_directions @ shape
 
     def landmarks(self, fit: HandFit) -> Float[Tensor, "frames 21 3"]:
-        """Where the tracker's landmarks are on the hand: metres, camera axes.
-
-        Without pose blend shapes: what they move at a fingertip is within ``offset_tolerance``.
-        """
+        """Where the tracker's landmarks are on the hand: metres, camera axes."""
         joints = self.joints(fit.shape_coefficients)
         transforms = bone_transforms(fit.rotations, joints)[:, self.landmark_bones]
         rest = self._landmarks + self._landmark_directions @ fit.shape_coefficients + fit.offsets
+        if self.rig.pose_directions.numel():
+            # Of the fingertips alone: joints follow from the shape.
+            added = self.rig.pose_offsets(fit.rotations, self.rig.vertex_sets["fingertips"])
+            rest = rest.repeat(len(added), 1, 1).index_add(1, self._tip_landmarks, added)
         local = rest - joints[self.landmark_bones]
         turned = (transforms[..., :3, :3] @ local[..., None])[..., 0]
         return turned + transforms[..., :3, 3] + fit.translation[:, None]
@@ -114,6 +116,7 @@ class HandModel:
         per_vertex = rig.skin_weights[chosen] @ motion
         rest = (rig.template_vertices + rig.shape_directions @ shape)[chosen]
         if rig.pose_directions.numel():
+            # Of all vertices: gathering each frame's directions of the chosen ones takes longer.
             added = rig.pose_offsets(fit.rotations)
             rest = rest + added.gather(1, chosen[..., None].expand(-1, -1, 3))
         blended = per_vertex[..., :9].unflatten(-1, (3, 3))

@@ -179,22 +179,26 @@ class Rig:
         return ShapedHand(self, vertices, self.joint_regressor @ vertices)
 
     def pose_offsets(
-        self, rotations: Float[Tensor, "*batch bones 3"]
-    ) -> Float[Tensor, "*batch vertices 3"]:
+        self,
+        rotations: Float[Tensor, "*batch bones 3"],
+        chosen: Int[Tensor, "chosen"] | None = None,
+    ) -> Float[Tensor, "*batch _ 3"]:
         """What a pose adds to the rest vertices before skinning (pose blend shapes), metres.
 
         Zero in the zero pose, and in every pose of a rig without ``pose_directions``.
 
         Args:
             rotations: axis-angle, radians, relative to the parent; the wrist's does not matter.
+            chosen: which vertices, by default all.
 
         Source: paper appendix A, B_p in the shape equation; as in MANO.
         """
-        if self.pose_directions.numel() == 0:
-            return self.template_vertices.new_zeros(*rotations.shape[:-2], self.num_vertices, 3)
+        directions = self.pose_directions if chosen is None else self.pose_directions[chosen]
+        if directions.numel() == 0:
+            return directions.new_zeros(*rotations.shape[:-2], len(directions), 3)
         matrices = matrix_from_axis_angle(rotations[..., 1:, :])
         features = (matrices - torch.eye(3).to(matrices)).flatten(-3)
-        return (features @ self.pose_directions.flatten(0, 1).T).unflatten(-1, (-1, 3))
+        return (features @ directions.flatten(0, 1).T).unflatten(-1, (-1, 3))
 
 
 @dataclass(frozen=True, eq=False)
