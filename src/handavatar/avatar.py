@@ -39,7 +39,9 @@ from handavatar.render.rasterize import rasterize
 from handavatar.render.sampling import depths_along, intervals_through_boxes
 from handavatar.render.volume import composite_sparse, visibility
 
-SCHEMA = 1
+SCHEMA = 2
+PRIOR_ROUNDS = 1
+"""Subdivisions of the mesh whose surface points the occupancy prior was trained with."""
 START_LIGHT = 0.65
 """Illumination of an untrained avatar: room to grow brighter and darker."""
 _OF_LICENSED_RIG = ("illumination.position_codes",)
@@ -209,7 +211,8 @@ class HandAvatar(nn.Module):
         self.rounds = rounds
         self.info: dict[str, Any] = dict(info or {})
         self.rig = subdivided(rig, rounds)
-        self.parts: Parts = divide_into_parts(self.rig)
+        known = subdivided(rig, min(rounds, PRIOR_ROUNDS))
+        self.parts: Parts = divide_into_parts(self.rig, drawn_on=known)
         anchors = anchors or place_anchors(self.rig, num_anchors)
         self.register_buffer("coefficients", coefficients.clone())
         self.register_buffer("anchor_corners", anchors.faces)

@@ -10,6 +10,7 @@ from handavatar.field.shape import (
     ShapeOffsets,
     personal_hand,
 )
+from handavatar.hand.detail import subdivided
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import NUM_BONES
 
@@ -44,6 +45,27 @@ def test_the_pose_as_a_bias_equals_the_pose_as_an_input() -> None:
     assert inputs.shape[-1] == 84
     expected = OFFSET_SCALE * field.mlp(inputs)
     torch.testing.assert_close(field(rest, rotations), expected, atol=1e-6, rtol=1e-4)
+
+
+def test_what_is_fitted_at_the_vertices_holds_between_them() -> None:
+    """Waves shorter than the mesh's edges would fold the finer mesh of the same hand."""
+    torch.manual_seed(0)
+    rig = load_open_hand("778")
+    fine = subdivided(rig, 1)
+    rest, rotations, field = rig.shaped(), _rotations(), ShapeOffsets()
+
+    def wanted(vertices: torch.Tensor) -> torch.Tensor:
+        return 0.003 * torch.sin(vertices * 100)  # a wave of 63 mm
+
+    optimizer = torch.optim.Adam(field.parameters(), lr=4e-3)
+    for _ in range(60):
+        optimizer.zero_grad()
+        error = 1e3 * (field(rest, rotations) - wanted(rest.rest_vertices))
+        error.square().mean().backward()
+        optimizer.step()
+    with torch.no_grad():
+        between = field(fine.shaped(), rotations) - wanted(fine.shaped().rest_vertices)
+    assert float(between[rig.num_vertices :].norm(dim=-1).mean()) < 3e-4
 
 
 def test_the_wrist_stays_whatever_the_offsets() -> None:

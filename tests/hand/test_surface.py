@@ -10,6 +10,7 @@ from torch import Tensor
 from handavatar.field.occupancy import PairOccupancy
 from handavatar.geometry.extraction import ExtractedSurface, extract_surface, num_components
 from handavatar.geometry.rotations import apply_rigid
+from handavatar.hand.detail import subdivided
 from handavatar.hand.parts import Parts, divide_into_parts
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
@@ -128,6 +129,20 @@ def test_a_part_without_area_is_refused(rig: Rig) -> None:
     vertices[rig.faces[faces].unique()] = vertices[labels == 3][0]
     with pytest.raises(RigError, match=r"bone 3 have no area"):
         divide_into_parts(replace(rig, template_vertices=vertices))
+
+
+def test_a_finer_hand_keeps_the_points_that_were_drawn_on_the_coarser(
+    rig: Rig, parts: Parts
+) -> None:
+    fine = subdivided(rig, 1)
+    divided = divide_into_parts(fine, drawn_on=rig)
+    assert len(divided.vertex_labels) == fine.num_vertices
+    assert torch.equal(divided.corner_indices, parts.corner_indices)
+    flat = HandPose.flat()
+    clouds = divided.point_clouds(fine.shaped().posed(flat))
+    torch.testing.assert_close(clouds, parts.point_clouds(rig.shaped().posed(flat)))
+    with pytest.raises(ValueError, match="no coarser level"):
+        divide_into_parts(rig, drawn_on=fine)
 
 
 def test_a_bone_without_skin_is_refused(rig: Rig) -> None:

@@ -10,8 +10,9 @@ from handavatar.field.layers import MLP, positional_encoding
 from handavatar.hand.pose import NUM_BONES
 from handavatar.hand.rig import ShapedHand
 
-HAND_SCALE = 0.1
-"""Rest positions are divided by this (metres) before they are encoded."""
+HAND_SCALE = 0.4
+"""Rest positions are divided by this (metres) before they are encoded: the finest wave is 25 mm
+long. Shorter ones would go up and down between the vertices of the coarse mesh, unseen by it."""
 NUM_FREQUENCIES = 6
 OFFSET_SCALE = 0.01
 """The network's output is multiplied by this (metres), so that its weights are of order one."""

@@ -103,21 +103,31 @@ class Parts:
         return PartBoxes(bone_from_world, lower, upper, margin, outmost, normal)
 
 
-def divide_into_parts(rig: Rig, points_per_part: int = 256, seed: int = 0) -> Parts:
+def divide_into_parts(
+    rig: Rig, points_per_part: int = 256, seed: int = 0, drawn_on: Rig | None = None
+) -> Parts:
     """Labels a rig's vertices and fixes the surface points of every part.
 
     Args:
         rig: the rig; its template decides everything.
         points_per_part: half of them on the part, half on the part and its surroundings.
         seed: of the surface sampling.
+        drawn_on: a coarser level of ``rig`` on whose faces the points are drawn. A trained
+            encoder knows its own points better than others of the same surface: give it those of
+            the level that it was trained on.
 
     Raises:
         RigError: if a bone owns no face, or none with an area.
+        ValueError: if ``drawn_on`` is no coarser level of ``rig``.
 
     Source: paper Sec. 3.2 (N^p = 256 points per part, uniform).
     Departs: the points are drawn once, evenly spread, and stay fixed, so that inference is
         deterministic; the authors redraw them at every pass, also when they evaluate.
     """
+    vertex_labels = rig.skin_weights.cpu().argmax(-1)
+    if drawn_on is not None:
+        _require_coarser(drawn_on, rig)
+        rig = drawn_on
     generator = torch.Generator().manual_seed(seed)
     vertices, faces = rig.template_vertices.cpu(), rig.faces.cpu()
     labels = rig.skin_weights.cpu().argmax(-1)
@@ -148,7 +158,17 @@ def divide_into_parts(rig: Rig, points_per_part: int = 256, seed: int = 0) -> Pa
         ]
         corner_indices.append(torch.cat([cloud.faces for cloud in clouds]))
         barycentric.append(torch.cat([cloud.barycentric for cloud in clouds]))
-    return Parts(labels, torch.stack(corner_indices), torch.stack(barycentric))
+    return Parts(vertex_labels, torch.stack(corner_indices), torch.stack(barycentric))
+
+
+def _require_coarser(coarse: Rig, fine: Rig) -> None:
+    """Subdivision keeps the vertices it finds, first and in their order."""
+    kept = fine.template_vertices[: coarse.num_vertices]
+    if not torch.equal(kept.cpu(), coarse.template_vertices.cpu()):
+        raise ValueError(
+            f"parts: {coarse.name} with {coarse.num_vertices} vertices is no coarser level of "
+            f"{fine.name} with {fine.num_vertices}, expected the rig before subdivision"
+        )
 
 
 def shuffled_pairs(seed: int) -> tuple[tuple[int, int], ...]:

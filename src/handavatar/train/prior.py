@@ -23,7 +23,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from handavatar.avatar import CheckpointError
+from handavatar.avatar import PRIOR_ROUNDS, CheckpointError
 from handavatar.evaluate.metrics import mask_iou
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
 from handavatar.hand.detail import subdivided
@@ -92,7 +92,7 @@ class PriorOptions:
     final_lr: float = 5e-5
     rig: str = "open-hand"
     level: Level = "full"
-    rounds: int = 1
+    rounds: int = PRIOR_ROUNDS
     seed: int = 0
     start_from: Path | None = None
     decoder: Decoder = "pair"
@@ -313,7 +313,7 @@ class PriorEvaluationOptions:
     points: int = 4096
     rig: str = "open-hand"
     level: Level = "full"
-    rounds: int = 1
+    rounds: int = PRIOR_ROUNDS
 
 
 def evaluate_prior(options: PriorEvaluationOptions) -> dict[str, float]:
