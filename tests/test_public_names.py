@@ -29,8 +29,8 @@ EXACTLY = {
     "hand.detail": "refined subdivided",
     "edit": "Edit bones_named",
     "avatar": (
-        "CheckpointError HandAvatar HandState RayValues RenderSettings Rendering SCHEMA "
-        "START_LIGHT VisibleSamples chosen_device"
+        "CheckpointError HandAvatar HandState PRIOR_ROUNDS RayValues RenderSettings Rendering "
+        "SCHEMA START_LIGHT VisibleSamples chosen_device"
     ),
     "capture.default": "default_capture",
 }

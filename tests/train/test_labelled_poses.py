@@ -2,10 +2,15 @@
 
 import torch
 
-from handavatar.geometry.meshes import distance_to_mesh
+from handavatar.geometry.meshes import distance_to_mesh, unique_edges
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import divide_into_parts
-from handavatar.train.labelled_poses import LabelledPose, PoseStream
+from handavatar.train.labelled_poses import (
+    LARGEST_OFFSET,
+    LabelledPose,
+    PoseStream,
+    random_person,
+)
 from handavatar.train.stage_times import StageTimes
 
 RIG = load_open_hand("778")
@@ -24,6 +29,26 @@ def test_a_hand_of_the_stream_is_the_same_whenever_it_is_drawn() -> None:
     assert torch.equal(first.is_inside, again.is_inside)
     for other in (_drawn(4), _drawn(3, seed=1), _drawn(4, seed=2)):
         assert not torch.equal(first.posed.vertices, other.posed.vertices)
+
+
+def test_the_streams_people_are_smooth_hands_off_the_rigs_shapes() -> None:
+    """No coefficients give them, yet neighbouring vertices move together."""
+    directions = RIG.shape_directions.flatten(0, 1)
+    rest = RIG.shaped()
+    edges = unique_edges(RIG.faces)
+    residuals, rough = [], []
+    for seed in range(20):
+        generator = torch.Generator().manual_seed(seed)
+        hand = random_person(rest, generator)
+        moved = hand.rest_vertices - rest.rest_vertices
+        torch.testing.assert_close(hand.rest_joints[0], rest.rest_joints[0])
+        fitted = torch.linalg.lstsq(directions, moved.flatten()[:, None]).solution
+        off = (moved.flatten() - (directions @ fitted)[:, 0]).reshape(-1, 3)
+        residuals.append(float(off.square().mean().sqrt()))
+        rough.append(float((off[edges[:, 0]] - off[edges[:, 1]]).square().mean().sqrt()))
+    assert max(residuals) < 3 * LARGEST_OFFSET
+    assert sorted(residuals)[10] > 0.1 * LARGEST_OFFSET
+    assert sum(rough) < 0.7 * sum(residuals)
 
 
 def test_labels_equal_those_of_the_exact_winding_number() -> None:
