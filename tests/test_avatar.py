@@ -13,6 +13,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from handavatar.avatar import (
+    SCHEMA,
     CheckpointError,
     HandAvatar,
     HandState,
@@ -24,7 +25,10 @@ from handavatar.edit import Edit, bones_named
 from handavatar.field.shading import OrientedCues
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.hand.detail import subdivided
+from handavatar.hand.parts import POINT_ROUNDS, divide_into_parts
 from handavatar.hand.pose import NUM_BONES, HandPose
+from handavatar.hand.rig import Rig
 from handavatar.render.sampling import depths_along, intervals_through_boxes
 from handavatar.render.volume import composite, visibility
 
@@ -359,9 +363,24 @@ def _rewritten(file: Path, tmp_path: Path, about: object, drop: str = "-") -> Pa
     return path
 
 
-@pytest.mark.parametrize("about", [None, [], {"schema": 2}, {"schema": 1}, {"schema": 1, "rig": 3}])
+@pytest.mark.parametrize("rounds", [0, 1, 2])
+def test_the_field_is_given_the_points_that_its_prior_knows(rig: Rig, rounds: int) -> None:
+    avatar = HandAvatar(rig, torch.zeros(10), rounds=rounds, num_anchors=64)
+    known = divide_into_parts(subdivided(rig, min(rounds, POINT_ROUNDS)))
+    assert torch.equal(avatar.parts.corner_indices, known.corner_indices)
+    assert torch.equal(avatar.parts.barycentric, known.barycentric)
+    assert len(avatar.parts.vertex_labels) == avatar.rig.num_vertices
+
+
+@pytest.mark.parametrize("about", [None, [], {"schema": SCHEMA - 1}, {"schema": SCHEMA + 1}])
 def test_another_schema_is_refused(file: Path, tmp_path: Path, about: object) -> None:
-    with pytest.raises(CheckpointError, match=r"other\.safetensors"):
+    with pytest.raises(CheckpointError, match=r"other\.safetensors: not an avatar of schema"):
+        HandAvatar.load(_rewritten(file, tmp_path, about))
+
+
+@pytest.mark.parametrize("about", [{"schema": SCHEMA}, {"schema": SCHEMA, "rig": 3}])
+def test_a_file_that_says_too_little_is_refused(file: Path, tmp_path: Path, about: object) -> None:
+    with pytest.raises(CheckpointError, match=r"other\.safetensors: not a complete avatar"):
         HandAvatar.load(_rewritten(file, tmp_path, about))
 
 

@@ -29,7 +29,7 @@ EXACTLY = {
     "hand.detail": "refined subdivided",
     "edit": "Edit bones_named",
     "avatar": (
-        "CheckpointError HandAvatar HandState PRIOR_ROUNDS RayValues RenderSettings Rendering "
+        "CheckpointError HandAvatar HandState RayValues RenderSettings Rendering "
         "SCHEMA START_LIGHT VisibleSamples chosen_device"
     ),
     "capture.default": "default_capture",

@@ -30,8 +30,7 @@ from handavatar.field.shading import (
 from handavatar.field.shape import ShapeOffsets, personal_hand
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
-from handavatar.hand.detail import subdivided
-from handavatar.hand.parts import Parts, divide_into_parts
+from handavatar.hand.parts import finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import RIG_ARRAYS, PosedHand, Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
@@ -40,8 +39,6 @@ from handavatar.render.sampling import depths_along, intervals_through_boxes
 from handavatar.render.volume import composite_sparse, visibility
 
 SCHEMA = 2
-PRIOR_ROUNDS = 1
-"""Subdivisions of the mesh whose surface points the occupancy prior was trained with."""
 START_LIGHT = 0.65
 """Illumination of an untrained avatar: room to grow brighter and darker."""
 _OF_LICENSED_RIG = ("illumination.position_codes",)
@@ -210,9 +207,7 @@ class HandAvatar(nn.Module):
         self.base_rig = rig
         self.rounds = rounds
         self.info: dict[str, Any] = dict(info or {})
-        self.rig = subdivided(rig, rounds)
-        known = subdivided(rig, min(rounds, PRIOR_ROUNDS))
-        self.parts: Parts = divide_into_parts(self.rig, drawn_on=known)
+        self.rig, self.parts = finer_rig(rig, rounds)
         anchors = anchors or place_anchors(self.rig, num_anchors)
         self.register_buffer("coefficients", coefficients.clone())
         self.register_buffer("anchor_corners", anchors.faces)

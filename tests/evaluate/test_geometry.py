@@ -14,7 +14,6 @@ from handavatar.evaluate.geometry import (
     roughness,
     seams,
 )
-from handavatar.evaluate.metrics import mask_iou
 from handavatar.geometry.extraction import ExtractedSurface, Field
 from handavatar.geometry.meshes import unique_edges, vertex_normals
 from handavatar.hand.detail import subdivided
@@ -51,13 +50,6 @@ def _extracted(truth: Truth, field: Field) -> ExtractedSurface:
 @pytest.fixture(scope="module")
 def exact(flat: Truth) -> ExtractedSurface:
     return _extracted(flat, flat.occupancy)
-
-
-def test_intersection_over_union() -> None:
-    a, b = torch.tensor([1, 1, 0, 0]).bool(), torch.tensor([1, 0, 1, 0]).bool()
-    assert mask_iou(a, b) == pytest.approx(1 / 3)
-    assert mask_iou(a, a) == 1
-    assert mask_iou(~(a | ~a), ~(a | ~a)) == 1
 
 
 def test_roughness_is_that_of_a_loop_and_grows_with_noise(exact: ExtractedSurface) -> None:

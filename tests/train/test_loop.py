@@ -15,7 +15,7 @@ import torch
 from conftest import TINY, write_tiny_capture
 from safetensors.torch import load_file
 
-from handavatar.avatar import CheckpointError, HandAvatar
+from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar
 from handavatar.capture.frames import CaptureError, read_capture
 from handavatar.evaluate.perceptual import perceptual_loss
 from handavatar.hand.rig import RigError
@@ -384,6 +384,18 @@ def test_an_empty_mask_gives_the_middle() -> None:
 def test_every_epoch_shows_every_frame_once_in_another_order() -> None:
     epochs = [[loop._frame_number(7, 7 * epoch + i, seed=1) for i in range(7)] for epoch in (0, 1)]
     assert sorted(epochs[0]) == sorted(epochs[1]) == list(range(7)) and epochs[0] != epochs[1]
+
+
+def test_a_run_whose_weights_meant_something_else_is_not_continued(
+    tiny_capture: Path, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    options = replace(_options(tiny_capture, run), steps=1)
+    train(options)
+    record = json.loads((run / "options.json").read_text())
+    (run / "options.json").write_text(json.dumps({**record, "avatar_schema": SCHEMA - 1}))
+    with pytest.raises(CheckpointError, match="weights mean something else"):
+        train(options)
 
 
 def test_a_run_of_another_seed_is_not_continued(tiny_capture: Path, tmp_path: Path) -> None:

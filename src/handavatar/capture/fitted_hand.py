@@ -73,7 +73,9 @@ class HandModel:
             bones += [*chain, chain[-1]]
             rows += [*chain, NUM_BONES + _FINGERS.index(finger)]
         self.landmark_bones = torch.tensor(bones)
-        self._tip_landmarks = (torch.tensor(rows) >= NUM_BONES).nonzero()[:, 0]
+        self._tip_landmarks = torch.tensor(
+            [rows.index(NUM_BONES + finger) for finger in range(len(tips))]
+        )
         joint_directions = torch.einsum("bv,vcs->bcs", rig.joint_regressor, rig.shape_directions)
         points = torch.cat(
             [rig.joint_regressor @ rig.template_vertices, rig.template_vertices[tips]]

@@ -41,7 +41,7 @@ _BORDER_REACH = 6.0
 _BORDER_GAP = 2.0
 _BORDER_CIRCLE = 3.5
 _BORDER_NOISE = 6.0
-_BORDER_SMOOTHING = 1.0
+_BORDER_SMOOTHING = 2.0
 _BORDER_INERTIA = 0.03
 # Brightness, and half of the two colour differences of ITU-R BT.601.
 _LUMA_AND_COLOR = np.array(

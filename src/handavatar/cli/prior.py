@@ -3,8 +3,10 @@
 
 def train(words: list[str]) -> int:
     """Pre-train the occupancy prior on sampled poses and shapes."""
+    import shlex
+
     from handavatar.cli.arguments import parse
-    from handavatar.train.prior import PriorOptions, train_prior
+    from handavatar.train.prior import PriorEvaluationOptions, PriorOptions, train_prior
     from handavatar.train.processes import is_first_process
     from handavatar.train.progress import Progress
 
@@ -25,8 +27,11 @@ def train(words: list[str]) -> int:
         shares = [(share, name[6:]) for name, share in latest.items() if name.startswith("share_")]
         listed = ", ".join(f"{name} {share:.0%}" for share, name in sorted(shares, reverse=True))
         print(f"speed: {latest['samples_per_second']:,.0f} labelled points/s; {listed}")
-    rig = "" if options.rig == "open-hand" else f" --rig {options.rig}"
-    print(f"next: handavatar prior evaluate --prior {options.out}{rig}")
+    judged = ["--prior", str(options.out)]
+    for name in ("rig", "level", "rounds"):
+        if getattr(options, name) != getattr(PriorEvaluationOptions, name):
+            judged += [f"--{name}", str(getattr(options, name))]
+    print(f"next: handavatar prior evaluate {shlex.join(judged)}")
     return 0
 
 

@@ -17,11 +17,15 @@ from handavatar.geometry.meshes import (
     sample_surface_evenly,
 )
 from handavatar.geometry.rotations import apply_rigid, invert_rigid
+from handavatar.hand.detail import subdivided
 from handavatar.hand.pose import BONE_PARENTS, CONNECTED_PAIRS, NUM_BONES
 from handavatar.hand.rig import PosedHand, Rig, RigError
 
 EXTENSION = 0.010
 """How far a part's points reach into its neighbours, metres (as in the authors' code)."""
+POINT_ROUNDS = 1
+"""Finer levels of a rig have the points that are drawn at this one: a trained encoder knows its own
+points better than others of the same surface."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +116,11 @@ def divide_into_parts(
         rig: the rig; its template decides everything.
         points_per_part: half of them on the part, half on the part and its surroundings.
         seed: of the surface sampling.
-        drawn_on: a coarser level of ``rig`` on whose faces the points are drawn. A trained
-            encoder knows its own points better than others of the same surface: give it those of
-            the level that it was trained on.
+        drawn_on: a coarser level of ``rig`` on whose faces the points are drawn; see
+            :func:`finer_rig`.
+
+    Returns:
+        Tensors on the CPU, wherever the rig is.
 
     Raises:
         RigError: if a bone owns no face, or none with an area.
@@ -159,6 +165,17 @@ def divide_into_parts(
         corner_indices.append(torch.cat([cloud.faces for cloud in clouds]))
         barycentric.append(torch.cat([cloud.barycentric for cloud in clouds]))
     return Parts(vertex_labels, torch.stack(corner_indices), torch.stack(barycentric))
+
+
+def finer_rig(base: Rig, rounds: int) -> tuple[Rig, Parts]:
+    """A rig subdivided so many times, and its parts, with points as a prior knows them.
+
+    Raises:
+        RigError: as :func:`divide_into_parts`.
+    """
+    known = subdivided(base, min(rounds, POINT_ROUNDS))
+    rig = subdivided(known, max(rounds - POINT_ROUNDS, 0))
+    return rig, divide_into_parts(rig, drawn_on=known)
 
 
 def _require_coarser(coarse: Rig, fine: Rig) -> None:

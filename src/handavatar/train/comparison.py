@@ -20,9 +20,8 @@ from handavatar.evaluate.tables import Cell, ResultTable
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
 from handavatar.field.occupancy import HandCodes
 from handavatar.field.partwise import PartwiseOccupancy
-from handavatar.hand.detail import subdivided
 from handavatar.hand.open_hand import Level, load_open_hand
-from handavatar.hand.parts import Parts, divide_into_parts
+from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
@@ -69,7 +68,7 @@ class ComparisonOptions:
     judged_points: int = 4096
     measured_poses: int = 10
     level: Level = "full"
-    rounds: int = 1
+    rounds: int = POINT_ROUNDS
     device: str = "cpu"
 
 
@@ -275,8 +274,7 @@ def _summary(scores: DecoderScores, pair: DecoderScores | None) -> dict[str, Any
 def _attention(field: PartwiseOccupancy, options: ComparisonOptions) -> dict[str, Any]:
     """Writes the picture; figures of the trained decoder, and of an untrained one as control."""
     base = load_open_hand(options.level)
-    rig = subdivided(base, options.rounds)
-    parts = divide_into_parts(rig)
+    rig, parts = finer_rig(base, options.rounds)
     torch.manual_seed(options.seeds[0])
     untrained = untrained_field("transformer")
     assert isinstance(untrained, PartwiseOccupancy)

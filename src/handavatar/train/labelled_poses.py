@@ -25,11 +25,13 @@ SURFACE_SIGMAS = (0.00025, 0.0005, 0.001, 0.003)
 """Noise of training points at the surface, metres, in equal shares."""
 SURFACE_SHARE = 0.9
 """Share of the training points near the surface; the others lie anywhere in the part boxes."""
+STREAM = 2
+"""Counts the ways in which hands were ever drawn: a training never goes on with another one."""
 LARGEST_OFFSET = 0.002
 """Personal offsets of the training hands: standard deviation along each axis, at most, metres."""
 _WAVES = 8
 _WAVELENGTHS = (0.03, 0.15)
-# Fitted poses are a little off the sampled ones in every joint: standard deviation, radians, at most.
+# Standard deviation, radians, at most: fitted poses are a little off the sampled ones.
 _JITTER = 0.06
 
 
@@ -65,9 +67,16 @@ def labelled_pose(
     count: int,
     margin: float,
     generator: torch.Generator,
+    is_person: bool = False,
 ) -> LabelledPose:
-    """A hand of random shape in the given pose, with labelled points; what judges a prior."""
-    posed = _random_hand(rig, rotations, generator)
+    """A hand of random shape in the given pose, with labelled points; what judges a prior.
+
+    ``is_person`` moves it off the rig's shapes: see :func:`random_person`.
+    """
+    hand = _random_shape(rig, generator)
+    if is_person:
+        hand = random_person(hand, generator)
+    posed = hand.posed(HandPose(rotations, torch.zeros(3)))
     points = sample_points(parts, posed, count, margin, generator)
     return LabelledPose(posed, points, is_inside(posed.sealed_vertices, rig.sealed_faces, points))
 
@@ -93,14 +102,17 @@ class PoseStream:
     seed: int
 
     def drawn(self, number: int, times: StageTimes) -> LabelledPose:
-        """Hand ``number`` of the stream."""
+        """Hand ``number`` of the stream.
+
+        Departs: every joint is turned a little away from the sampled pose, beyond its limits at
+            times, as poses are that were fitted to videos.
+        """
         # Hashed, so that neither neighbouring seeds nor the seed that judges share numbers.
         state = np.random.SeedSequence([self.seed, number]).generate_state(1, np.uint64)
         generator = torch.Generator().manual_seed(int(state[0]))
         with times.stage("poses"):
             rotations = sample_poses(self.base, 1, generator)[0]
-            coefficients = torch.randn(self.rig.shape_directions.shape[-1], generator=generator)
-            hand = random_person(self.rig.shaped(coefficients), generator)
+            hand = random_person(_random_shape(self.rig, generator), generator)
             turn = _JITTER * float(torch.rand((), generator=generator))
             rotations = rotations + turn * torch.randn(rotations.shape, generator=generator)
             posed = hand.posed(HandPose(rotations, torch.zeros(3)))
@@ -135,8 +147,8 @@ def random_person(rest: ShapedHand, generator: torch.Generator) -> ShapedHand:
         rest: the hand to move a little.
         generator: draws the size of the offsets, up to ``LARGEST_OFFSET``, and their waves.
 
-    Departs: the paper trains on the rig's own shapes. No person is one of them: a prior that knew
-        only these was right for 77 of 100 points near the mesh of a person, not 92.
+    Departs: the paper trains on the rig's own shapes, and no person is one of them. The figure
+        ``iou_people`` of ``handavatar prior evaluate`` tells how a prior copes.
     """
     shortest, longest = _WAVELENGTHS
     lengths = shortest * (longest / shortest) ** torch.rand(_WAVES, 1, generator=generator)
@@ -149,11 +161,8 @@ def random_person(rest: ShapedHand, generator: torch.Generator) -> ShapedHand:
     return personal_hand(rest, offsets)
 
 
-def _random_hand(
-    rig: Rig, rotations: Float[Tensor, "bones 3"], generator: torch.Generator
-) -> PosedHand:
-    coefficients = torch.randn(rig.shape_directions.shape[-1], generator=generator)
-    return rig.shaped(coefficients).posed(HandPose(rotations, torch.zeros(3)))
+def _random_shape(rig: Rig, generator: torch.Generator) -> ShapedHand:
+    return rig.shaped(torch.randn(rig.shape_directions.shape[-1], generator=generator))
 
 
 def _box_points(

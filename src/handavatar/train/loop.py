@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
-from handavatar.avatar import CheckpointError, HandAvatar, RenderSettings, chosen_device
+from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar, RenderSettings, chosen_device
 from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
 from handavatar.capture.view import view_of
 from handavatar.evaluate.metrics import mean_color
@@ -559,7 +559,8 @@ def _open_or_create(options: TrainOptions, capture: Capture, perceptual: str, st
         for name, value in asdict(options).items()
     }
     budget = asdict(METHODS[options.method])
-    record |= {"steps": steps, "budget": budget | {"cues": METHODS[options.method].cues.name}}
+    record |= {"steps": steps, "avatar_schema": SCHEMA}
+    record |= {"budget": budget | {"cues": METHODS[options.method].cues.name}}
     return create_run(
         folder,
         record,
@@ -572,6 +573,11 @@ def _open_or_create(options: TrainOptions, capture: Capture, perceptual: str, st
 
 def _require_same_training(run: Run, options: TrainOptions, capture: Capture) -> None:
     """A run goes on with what it was begun with, or not at all."""
+    if run.options.get("avatar_schema") != SCHEMA:
+        raise CheckpointError(
+            f"{run.folder}: was begun by a version whose weights mean something else\n"
+            "name another folder with --out, or begin anew with --resume never"
+        )
     facts = run.facts
     then = (facts["capture"]["sha256"], facts["seed"], run.options["method"])
     now = (capture.sha256, options.seed, options.method)

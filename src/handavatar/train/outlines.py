@@ -99,7 +99,7 @@ def fit_outlines(
     """
     generator = torch.Generator().manual_seed(seed)
     edges = EdgeSet.of(avatar.base_rig)
-    masks = [soft_mask(frame.mask, size).to(avatar.device) for frame in frames]
+    masks = [soft_mask(frame.mask, size) for frame in frames]
     optimizer = torch.optim.Adam(avatar.shape.parameters(), lr=_RATE, betas=(0.9, 0.99))
     passes = rounds * visits + (rounds + 1 if corrections else 0) * (rounds > 0)
     steps = rounds * visits * -(-len(frames) // _BATCH)
@@ -118,7 +118,7 @@ def fit_outlines(
                             avatar,
                             corrections,
                             frames[number],
-                            masks[number],
+                            masks[number].to(avatar.device),
                             number,
                             edges,
                             len(chosen),

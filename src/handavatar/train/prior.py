@@ -1,7 +1,8 @@
 """Pre-training of the occupancy prior on sampled poses and shapes.
 
-No data set: poses come from the sampler of plausible poses, shapes from the rig's shape space,
-labels from the generalised winding number of the sealed mesh (an overlap of fingers is inside).
+No data set: poses come from the sampler of plausible poses, shapes from the rig's shape space with
+some waves that it does not know, labels from the generalised winding number of the sealed mesh (an
+overlap of fingers is inside).
 Nothing depends on the wrist's placement: the field works in the frames of the bones.
 
 Several processes: ``torchrun --nproc-per-node 2 -m handavatar prior train --poses 2 ...``. Torchrun
@@ -23,16 +24,15 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from handavatar.avatar import PRIOR_ROUNDS, CheckpointError
+from handavatar.avatar import CheckpointError
 from handavatar.evaluate.metrics import mask_iou
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
-from handavatar.hand.detail import subdivided
 from handavatar.hand.open_hand import Level
-from handavatar.hand.parts import Parts, divide_into_parts
+from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
-from handavatar.train.labelled_poses import LabelledPose, PoseStream, labelled_pose
+from handavatar.train.labelled_poses import STREAM, LabelledPose, PoseStream, labelled_pose
 from handavatar.train.pretraining import (
     OccupancyLoss,
     begin_prior_run,
@@ -73,7 +73,7 @@ class PriorOptions:
         final_lr: learning rate at the end; half a cosine in between.
         rig: the hand: ``open-hand``, an imported one (``mano-right``) or its file.
         level: ``778`` thins the open hand to MANO's size; other rigs have ``full`` alone.
-        rounds: midpoint subdivisions of the mesh that is encoded and labelled.
+        rounds: midpoint subdivisions of the mesh that is labelled and whose points are encoded.
         seed: of everything.
         start_from: a prior to continue from.
         decoder: ``pair`` is PairOF, the avatar's. Only for comparison with it: ``pair-shuffled``
@@ -92,7 +92,7 @@ class PriorOptions:
     final_lr: float = 5e-5
     rig: str = "open-hand"
     level: Level = "full"
-    rounds: int = PRIOR_ROUNDS
+    rounds: int = POINT_ROUNDS
     seed: int = 0
     start_from: Path | None = None
     decoder: Decoder = "pair"
@@ -159,8 +159,7 @@ def _trained(
         processes.wait()
         if not processes.is_first:
             done, average = load_progress(Run(options.folder), field, optimizers)
-    rig = subdivided(base, options.rounds)
-    parts = divide_into_parts(rig)
+    rig, parts = finer_rig(base, options.rounds)
     stream = PoseStream(base, rig, parts, field.margin, options.points, options.seed)
     times = StageTimes()
     loss_of: nn.Module = OccupancyLoss(field, parts.to(processes.device), times)
@@ -212,8 +211,9 @@ def _what_to_learn(options: PriorOptions, rig: Rig) -> dict[str, Any]:
     """The options on which the weights depend, as JSON; the rig as it is known anywhere."""
     elsewhere = ("out", "folder", "checkpoint_every", "device")
     record = {name: value for name, value in asdict(options).items() if name not in elsewhere}
-    start = None if options.start_from is None else str(options.start_from)
-    return {**record, "rig": f"{rig.name} ({rig.sha256[:12]})", "start_from": start}
+    start = None if options.start_from is None else options.start_from.name
+    known = f"{rig.name} ({rig.sha256[:12]})"
+    return {**record, "rig": known, "start_from": start, "stream": STREAM}
 
 
 def save_prior(field: OccupancyField, options: PriorOptions, rig: Rig, step: int) -> None:
@@ -313,38 +313,46 @@ class PriorEvaluationOptions:
     points: int = 4096
     rig: str = "open-hand"
     level: Level = "full"
-    rounds: int = PRIOR_ROUNDS
+    rounds: int = POINT_ROUNDS
 
 
 def evaluate_prior(options: PriorEvaluationOptions) -> dict[str, float]:
     """Intersection over union on unseen poses whose self-penetration is resolved.
 
     Returns:
-        ``iou`` (mean over poses of the mean of the next two), ``iou_boxes``, ``iou_surface``.
+        ``iou`` (mean over poses of the mean of the next two), ``iou_boxes``, ``iou_surface``; and
+        ``iou_people``, the same as ``iou`` on hands that no shape coefficients give.
     """
     field = open_prior(options.prior)
     parts, samples = evaluation_poses(options, field.margin)
     scores = pose_scores(field, parts, samples)
     boxes, surface = scores.mean(0).tolist()
-    return {"iou": (boxes + surface) / 2, "iou_boxes": boxes, "iou_surface": surface}
+    parts, people = evaluation_poses(options, field.margin, are_people=True)
+    return {
+        "iou": (boxes + surface) / 2,
+        "iou_boxes": boxes,
+        "iou_surface": surface,
+        "iou_people": float(pose_scores(field, parts, people).mean()),
+    }
 
 
 def evaluation_poses(
-    options: PriorEvaluationOptions, margin: float
+    options: PriorEvaluationOptions, margin: float, are_people: bool = False
 ) -> tuple[Parts, list[LabelledPose]]:
     """Unseen poses of unseen shapes with labelled points, the same at every call.
 
     Args:
         options: how many; ``prior`` plays no part.
         margin: of the part boxes, metres.
+        are_people: whether the hands are off the rig's shapes.
     """
     base = load_rig(options.rig, options.level)
-    rig = subdivided(base, options.rounds)
-    parts = divide_into_parts(rig)
-    generator = torch.Generator().manual_seed(EVALUATION_SEED)
+    rig, parts = finer_rig(base, options.rounds)
+    generator = torch.Generator().manual_seed(EVALUATION_SEED + are_people)
     rotations = resolve_penetration(base, sample_poses(base, options.poses, generator))
     return parts, [
-        labelled_pose(rig, parts, pose, options.points, margin, generator) for pose in rotations
+        labelled_pose(rig, parts, pose, options.points, margin, generator, are_people)
+        for pose in rotations
     ]
 
 

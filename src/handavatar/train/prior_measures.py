@@ -23,8 +23,7 @@ from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.metrics import mask_iou
 from handavatar.field.decoders import OccupancyField
 from handavatar.geometry.extraction import Field, num_components
-from handavatar.hand.detail import subdivided
-from handavatar.hand.parts import PartBoxes, divide_into_parts
+from handavatar.hand.parts import PartBoxes, Parts, divide_into_parts, finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations, resolve_penetration, sample_poses
 from handavatar.hand.rig import PosedHand, Rig
@@ -116,6 +115,7 @@ def measure_prior(
     resolution: int = 128,
     truths: Sequence[PosedHand] | None = None,
     num_points: int = 4096,
+    parts: Parts | None = None,
 ) -> list[GeometryRow]:
     """One row per hand; deterministic, so that rows of several priors are paired.
 
@@ -126,13 +126,14 @@ def measure_prior(
         truths: the hands that the field is held against, by default those that guide it; give
             the fine ones to judge fields that are guided by a coarse mesh.
         num_points: judged for IoU, and as many near contacts.
+        parts: of the guiding rig, where ``divide_into_parts`` would draw other points.
 
     Raises:
         ValueError: if a field has no surface in some pose, or answers NaN.
 
     Source: paper Sec. 4.2, Tab. 1.
     """
-    parts = divide_into_parts(hands[0].rig)
+    parts = parts or divide_into_parts(hands[0].rig)
     truths = hands if truths is None else truths
     skin = Skin.of(truths[0].rig)
     truth_parts = parts if truths is hands else divide_into_parts(truths[0].rig)
@@ -226,9 +227,9 @@ def measure_prior_file(
         resolution: cells along the longest side of the extraction's box.
     """
     field = open_prior(prior)
-    rig = subdivided(base, rounds)
+    rig, parts = finer_rig(base, rounds)
     return {
-        name: summarised(measure_prior(field, hands(rig, base, count), resolution))
+        name: summarised(measure_prior(field, hands(rig, base, count), resolution, parts=parts))
         for name, hands in (("unseen", unseen_hands), ("fists", unseen_fists))
     }
 

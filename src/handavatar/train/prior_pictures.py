@@ -14,9 +14,8 @@ from handavatar.evaluate.geometry import Skin, Truth
 from handavatar.field.decoders import OccupancyField
 from handavatar.geometry.cameras import Camera, look_at
 from handavatar.geometry.extraction import Field
-from handavatar.hand.detail import subdivided
 from handavatar.hand.open_hand import Level
-from handavatar.hand.parts import divide_into_parts
+from handavatar.hand.parts import POINT_ROUNDS, finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
@@ -62,7 +61,7 @@ class PriorPictureOptions:
     size: int = 320
     rig: str = "open-hand"
     level: Level = "full"
-    rounds: int = 1
+    rounds: int = POINT_ROUNDS
     truth: bool = True
 
 
@@ -74,8 +73,8 @@ def picture_priors(options: PriorPictureOptions) -> list[Path]:
         RigError: if there is no such rig, or not at this level.
     """
     base = load_rig(options.rig, options.level)
-    rig = subdivided(base, options.rounds)
-    parts, skin = divide_into_parts(rig), Skin.of(rig)
+    rig, parts = finer_rig(base, options.rounds)
+    skin = Skin.of(rig)
     fields: dict[str, FieldOf] = {}
     for path in options.priors:
         prior = open_prior(path)
