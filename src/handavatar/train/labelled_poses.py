@@ -25,14 +25,10 @@ SURFACE_SIGMAS = (0.00025, 0.0005, 0.001, 0.003)
 """Noise of training points at the surface, metres, in equal shares."""
 SURFACE_SHARE = 0.9
 """Share of the training points near the surface; the others lie anywhere in the part boxes."""
-STREAM = 2
-"""Counts the ways in which hands were ever drawn: a training never goes on with another one."""
 LARGEST_OFFSET = 0.002
-"""Personal offsets of the training hands: standard deviation along each axis, at most, metres."""
+"""Of people's hands from the rig's: standard deviation along each axis, at most, metres."""
 _WAVES = 8
 _WAVELENGTHS = (0.03, 0.15)
-# Standard deviation, radians, at most: fitted poses are a little off the sampled ones.
-_JITTER = 0.06
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,19 +98,13 @@ class PoseStream:
     seed: int
 
     def drawn(self, number: int, times: StageTimes) -> LabelledPose:
-        """Hand ``number`` of the stream.
-
-        Departs: every joint is turned a little away from the sampled pose, beyond its limits at
-            times, as poses are that were fitted to videos.
-        """
+        """Hand ``number`` of the stream."""
         # Hashed, so that neither neighbouring seeds nor the seed that judges share numbers.
         state = np.random.SeedSequence([self.seed, number]).generate_state(1, np.uint64)
         generator = torch.Generator().manual_seed(int(state[0]))
         with times.stage("poses"):
             rotations = sample_poses(self.base, 1, generator)[0]
-            hand = random_person(_random_shape(self.rig, generator), generator)
-            turn = _JITTER * float(torch.rand((), generator=generator))
-            rotations = rotations + turn * torch.randn(rotations.shape, generator=generator)
+            hand = _random_shape(self.rig, generator)
             posed = hand.posed(HandPose(rotations, torch.zeros(3)))
         with times.stage("points"):
             points = training_points(self.parts, posed, self.points, self.margin, generator)
@@ -146,9 +136,6 @@ def random_person(rest: ShapedHand, generator: torch.Generator) -> ShapedHand:
     Args:
         rest: the hand to move a little.
         generator: draws the size of the offsets, up to ``LARGEST_OFFSET``, and their waves.
-
-    Departs: the paper trains on the rig's own shapes, and no person is one of them. The figure
-        ``iou_people`` of ``handavatar prior evaluate`` tells how a prior copes.
     """
     shortest, longest = _WAVELENGTHS
     lengths = shortest * (longest / shortest) ** torch.rand(_WAVES, 1, generator=generator)

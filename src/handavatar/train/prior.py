@@ -1,8 +1,7 @@
 """Pre-training of the occupancy prior on sampled poses and shapes.
 
-No data set: poses come from the sampler of plausible poses, shapes from the rig's shape space with
-some waves that it does not know, labels from the generalised winding number of the sealed mesh (an
-overlap of fingers is inside).
+No data set: poses come from the sampler of plausible poses, shapes from the rig's shape space,
+labels from the generalised winding number of the sealed mesh (an overlap of fingers is inside).
 Nothing depends on the wrist's placement: the field works in the frames of the bones.
 
 Several processes: ``torchrun --nproc-per-node 2 -m handavatar prior train --poses 2 ...``. Torchrun
@@ -32,7 +31,7 @@ from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
-from handavatar.train.labelled_poses import STREAM, LabelledPose, PoseStream, labelled_pose
+from handavatar.train.labelled_poses import LabelledPose, PoseStream, labelled_pose
 from handavatar.train.pretraining import (
     OccupancyLoss,
     begin_prior_run,
@@ -48,13 +47,16 @@ from handavatar.train.stage_times import StageTimes
 from handavatar.train.stopping import Interrupted, stop_signals
 
 SHIPPED_PRIOR = Path(__file__).parent.parent / "assets" / "prior.safetensors"
-"""Made in three stages, each from the result of the last:
+"""Made in stages, each from the result of the last:
 
 1. at commit 214103c ``handavatar prior train --steps 9000 --out a.safetensors``, then ``--start
    a.safetensors --steps 5000 --lr 6e-4 --final-lr 3e-5 --warm-up 0 --seed 1 --refresh 2`` (a pool
    of poses and squared error, words that only that commit understands);
 2. at commit eb43742 ``--start-from A --steps 1000 --lr 4e-4 --final-lr 4e-6 --seed 21`` (Adam);
-3. at commit 7f644f9 ``--start-from B --steps 1200 --lr 5e-4 --final-lr 5e-6 --seed 22`` (Muon).
+3. at commit 7f644f9 ``--start-from B --steps 1200 --lr 5e-4 --final-lr 5e-6 --seed 22`` (Muon);
+4. at commit df72211 ``--start-from C --steps 10000 --lr 6e-4 --final-lr 3e-6 --seed 23``, then
+   ``--start-from D --steps 13000 --lr 6e-4 --final-lr 2e-6 --seed 24``: half an hour of one core
+   each, from an IoU of 0.928 to 0.955 and 0.965.
 """
 EVALUATION_SEED = 1_000_003
 """Evaluation poses come from seeds that training never draws."""
@@ -213,7 +215,7 @@ def _what_to_learn(options: PriorOptions, rig: Rig) -> dict[str, Any]:
     record = {name: value for name, value in asdict(options).items() if name not in elsewhere}
     start = None if options.start_from is None else options.start_from.name
     known = f"{rig.name} ({rig.sha256[:12]})"
-    return {**record, "rig": known, "start_from": start, "stream": STREAM}
+    return {**record, "rig": known, "start_from": start}
 
 
 def save_prior(field: OccupancyField, options: PriorOptions, rig: Rig, step: int) -> None:
