@@ -128,7 +128,7 @@ METHODS: dict[str, Method] = {
         lr=2e-3,
         lr_shape=2e-3,
         lr_codes=1e-2,
-        lr_decoder=2e-3,  # a fifth of it by the first joint step
+        lr_decoder=4e-4,
         occupancy_every=4,
     ),
     "paper": Method(
