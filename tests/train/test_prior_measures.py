@@ -79,7 +79,8 @@ def test_prior_evaluate_extracts_meshes_only_if_asked(capsys: pytest.CaptureFixt
         "--json",
     ]
     assert cli.main(words) == 0
-    assert set(json.loads(capsys.readouterr().out)) == {"iou", "iou_boxes", "iou_surface"}
+    asked_for = {"iou", "iou_boxes", "iou_surface", "iou_people"}
+    assert set(json.loads(capsys.readouterr().out)) == asked_for
 
 
 def test_a_prior_file_is_measured_on_unseen_poses_and_fists() -> None:
