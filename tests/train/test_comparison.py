@@ -152,18 +152,8 @@ def test_impossible_comparisons_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_table_has_a_row_per_decoder_and_says_what_it_rests_on(tmp_path: Path) -> None:
-    options = GeometryTableOptions(
-        tmp_path,
-        decoders=("pair", "coap"),
-        steps=2,
-        points=64,
-        poses=2,
-        judged_points=256,
-        measured_poses=2,
-        level="778",
-        rounds=0,
-        resolution=16,
-    )
+    wanted = {"decoders": ("pair", "coap"), "steps": 2, "poses": 2, "resolution": 16}
+    options = GeometryTableOptions(**(vars(_options(tmp_path)) | wanted))
     told: list[int] = []
     table = geometry_table(options, told.append)
     assert list(table.rows) == ["pair", "coap"]

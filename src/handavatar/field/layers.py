@@ -14,7 +14,7 @@ def positional_encoding(
     """``[x, sin(2^k pi x), cos(2^k pi x)]`` for k below ``num_frequencies``.
 
     Args:
-        positions: normalised to about [-1, 1]; the finest wavelength is then ``2^(2 - k_max)``.
+        positions: normalised to [-1, 1] or less; the finest wavelength is then ``2^(2 - k_max)``.
         num_frequencies: number of octaves.
 
     Returns:

@@ -136,7 +136,7 @@ def divide_into_parts(
         rig = drawn_on
     generator = torch.Generator().manual_seed(seed)
     vertices, faces = rig.template_vertices.cpu(), rig.faces.cpu()
-    labels = rig.skin_weights.cpu().argmax(-1)
+    labels = vertex_labels[: len(vertices)]
     face_labels = labels[faces].mode(-1).values
     corner_indices, barycentric = [], []
     for bone in range(NUM_BONES):
