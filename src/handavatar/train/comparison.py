@@ -46,7 +46,8 @@ class ComparisonOptions:
     """How decoders are compared.
 
     Attributes:
-        priors: folder for the trained priors and the picture of attention maps.
+        priors: folder for the trained priors, their checkpoints and the picture of attention
+            maps; a comparison that was begun there with the same options is continued.
         decoders: which ones; ``pair`` must be among them, the others are compared with it.
         seeds: each one trains every decoder once, all on the same data.
         steps: optimisation steps of each training.
@@ -223,6 +224,7 @@ def _train(
             rounds=options.rounds,
             seed=seed,
             decoder=decoder,
+            folder=options.priors / name,
             device=options.device,
         ),
         None if report is None else lambda step, figures: report(name, step, figures),
