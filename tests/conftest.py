@@ -75,7 +75,7 @@ def lit_frame(
     return Frame(
         name=f"{index:06d}",
         image=(color * 255).round().to(torch.uint8),
-        mask=fragments.mask,
+        coverage=fragments.mask.byte() * 255,
         camera=camera,
         pose=pose,
         confidence=confidence,

@@ -35,7 +35,7 @@ def aligned_pose(
     hand_of: Callable[[HandPose], ShapedHand],
     pose: HandPose,
     camera: Camera,
-    mask: Bool[Tensor, "height width"],
+    coverage: Float[Tensor, "height width"],
     steps: int = 8,
     start: HandPose | None = None,
 ) -> HandPose:
@@ -48,14 +48,15 @@ def aligned_pose(
         hand_of: the rest hand of a pose.
         pose: as tracked; the result stays near it as far as the outline does not object.
         camera: of the picture.
-        mask: true on the hand.
+        coverage: of each pixel by the hand in the picture, in [0, 1].
         steps: of Gauss-Newton.
         start: where to begin, if not at ``pose``.
     """
     found = start or pose
+    mask = coverage >= 0.5
     if not bool(mask.any()) or steps == 0:
         return found
-    distance = _smoothed(signed_distance(mask).to(pose.rotations.device))
+    distance = _smoothed(signed_distance(coverage).to(pose.rotations.device))
     before = _overlap(hand_of(found), found, camera, mask)
     first = found
     for _ in range(steps):

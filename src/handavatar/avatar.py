@@ -38,7 +38,7 @@ from handavatar.render.rasterize import rasterize
 from handavatar.render.sampling import depths_along, intervals_through_boxes
 from handavatar.render.volume import composite_sparse, visibility
 
-SCHEMA = 2
+SCHEMA = 3
 START_LIGHT = 0.65
 """Illumination of an untrained avatar: room to grow brighter and darker."""
 _OF_LICENSED_RIG = ("illumination.position_codes",)
@@ -494,6 +494,7 @@ class HandAvatar(nn.Module):
             "rounds": self.rounds,
             "margin": self.occupancy.margin,
             "softness": self.occupancy.softness,
+            "sharpness": self.occupancy.sharpness,
             "cues": self.illumination.chosen.name,
             "info": self.info,
         }
@@ -554,6 +555,7 @@ class HandAvatar(nn.Module):
             )
             avatar.occupancy.margin = about["margin"]
             avatar.occupancy.softness = about["softness"]
+            avatar.occupancy.sharpness = about["sharpness"]
             if rig.is_licensed:
                 state |= {name: avatar.state_dict()[name] for name in _OF_LICENSED_RIG}
             avatar.load_state_dict(state)

@@ -40,7 +40,7 @@ def make_frame(index: int, split: str = "train") -> Frame:
     return Frame(
         name=f"{index:06d}",
         image=torch.randint(0, 256, (6, 8, 3), generator=generator, dtype=torch.uint8),
-        mask=mask,
+        coverage=mask.byte() * 255,
         camera=Camera(
             focal=(20.0 + index, 21.0),
             center=(3.7, 2.9),
@@ -84,7 +84,7 @@ def test_round_trip_keeps_everything(folder):
     for index, split in enumerate(("train", "train", "test")):
         frame, expected = capture.frame(index), make_frame(index, split)
         assert torch.equal(frame.image, expected.image)
-        assert torch.equal(frame.mask, expected.mask)
+        assert torch.equal(frame.coverage, expected.coverage)
         # Rotations and translations are stored as doubles: float32 comes back bit by bit.
         assert torch.equal(frame.pose.rotations, expected.pose.rotations)
         assert torch.equal(frame.pose.translation, expected.pose.translation)

@@ -48,7 +48,7 @@ def frame(seed: int, noise: float = 0.1, radius: float = 10) -> JudgedFrame:
     truth, mask = blobs(seed), disc(radius)
     generator = torch.Generator().manual_seed(seed)
     rendered = (truth + noise * torch.randn(truth.shape, generator=generator)).clamp(0, 1)
-    return JudgedFrame(rendered * mask[..., None], mask, truth, mask)
+    return JudgedFrame(rendered * mask[..., None], mask, truth, mask.float())
 
 
 def test_psnr_equals_skimage_and_is_bounded() -> None:
@@ -146,7 +146,7 @@ def test_masked_protocol_ignores_what_is_far_from_both_hands() -> None:
         judged.rendered + far[..., None].float(),
         judged.rendered_mask,
         judged.truth,
-        judged.truth_mask,
+        judged.truth_coverage,
     )
     assert masked_psnr(spoilt) == alone
     assert paper_scores([spoilt]).psnr < paper_scores([judged]).psnr - 3
@@ -162,7 +162,7 @@ def test_black_background_inflates_the_papers_psnr_by_the_regions_share() -> Non
 def test_a_hand_in_the_wrong_place_counts_in_both_places() -> None:
     truth, mask = blobs(4, 64, 64), disc(6, 64, 64)
     moved = mask.roll(24, 1)
-    judged = JudgedFrame(truth * moved[..., None], moved, truth, mask)
+    judged = JudgedFrame(truth * moved[..., None], moved, truth, mask.float())
     assert torch.equal(judged.region(), dilated(mask | moved, REGION_MARGIN))
     assert masked_psnr(judged) < 15
     assert mean_mask_iou([judged]) == 0
@@ -193,7 +193,7 @@ def test_no_frames_and_frames_without_a_hand_are_refused() -> None:
         paper_scores([])
     empty = torch.zeros(48, 40, dtype=torch.bool)
     with pytest.raises(ValueError, match="shows a hand"):
-        masked_psnr(JudgedFrame(blobs(0), empty, blobs(0), empty))
+        masked_psnr(JudgedFrame(blobs(0), empty, blobs(0), empty.float()))
 
 
 def test_the_mean_color_is_the_best_single_color() -> None:
@@ -201,10 +201,11 @@ def test_the_mean_color_is_the_best_single_color() -> None:
     color = mean_color(images, masks)
     pixels = torch.cat([images[0][masks[0]], images[1][masks[1]]])
     assert torch.allclose(color, pixels.mean(0))
-    best = mean_color_masked_psnr(color, images[:1], masks[:1])
-    assert best > mean_color_masked_psnr(color + 0.1, images[:1], masks[:1])
+    coverages = [mask.float() for mask in masks[:1]]
+    best = mean_color_masked_psnr(color, images[:1], coverages)
+    assert best > mean_color_masked_psnr(color + 0.1, images[:1], coverages)
     plain = torch.ones(48, 40, 3) * torch.tensor([0.2, 0.4, 0.6])
-    assert mean_color_masked_psnr(plain[0, 0], [plain], masks[:1]) == PSNR_CEILING
+    assert mean_color_masked_psnr(plain[0, 0], [plain], coverages) == PSNR_CEILING
 
 
 @settings(max_examples=20, deadline=None)

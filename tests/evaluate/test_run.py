@@ -128,7 +128,7 @@ def test_tracked_poses_are_fitted_to_masks_and_known_ones_are_not(
     assert not seen
     tracked = write_tiny_capture(tmp_path / "tracked", "ab", confidence=0.9)
     metrics = evaluate_run(replace(options, capture=tracked, out=tmp_path / "out"))
-    assert len(seen) == 1 and torch.equal(seen[0], read_capture(tracked).frame(1).mask)
+    assert len(seen) == 1 and torch.equal(seen[0], read_capture(tracked).frame(1).alpha)
     assert any("fitted to their masks" in note for note in metrics["notes"])
 
 

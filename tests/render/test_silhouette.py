@@ -181,7 +181,9 @@ def test_descent_finds_a_mask_several_pixels_away() -> None:
     vertices, faces = crossing_fingers()
     view = camera(48)
     aim = torch.tensor([6 / 48, -5 / 48])
-    mask = soft_mask(rasterize(vertices + torch.cat([aim, torch.zeros(1)]), faces, view).mask, 48)
+    mask = soft_mask(
+        rasterize(vertices + torch.cat([aim, torch.zeros(1)]), faces, view).mask.float(), 48
+    )
     shift = torch.zeros(2, requires_grad=True)
     descent = torch.optim.Adam([shift], lr=0.02)
     for _ in range(40):
@@ -204,7 +206,7 @@ def test_the_printed_formula_is_that_of_binary_masks() -> None:
 
 def test_a_soft_mask_is_what_its_own_outline_covers() -> None:
     vertices, faces = crossing_fingers()
-    covered = rasterize(vertices, faces, camera(192)).mask
+    covered = rasterize(vertices, faces, camera(192)).mask.float()
     found = soft_mask(covered, 64)
     expected = soft_silhouette(vertices, faces, camera(64))
     # The mask knows its border to half a pixel of its own, a sixth of one here, and less in
@@ -218,7 +220,7 @@ def test_the_loss_is_least_on_the_mask_and_not_beside_it() -> None:
     posed = load_open_hand("778").shaped().posed(bent_pose(1))
     vertices, faces, view = posed.vertices, posed.rig.faces, camera_above(64)
     outwards = vertex_normals(vertices, faces) * (0.42 / view.focal[0])  # A pixel, metres.
-    soft = soft_mask(rasterize(vertices, faces, view.resized(512, 512)).mask, 64)
+    soft = soft_mask(rasterize(vertices, faces, view.resized(512, 512)).mask.float(), 64)
     hard = rasterize(vertices, faces, view).mask.float()
     offsets = torch.arange(-5, 11) * 0.1
     best = []
@@ -269,13 +271,13 @@ def test_the_lengths_of_a_tube_add_up_to_its_outline() -> None:
 def test_signed_distance_of_a_disc() -> None:
     y, x = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(50) + 0.5, indexing="ij")
     distance = torch.hypot(x - 24, y - 20) - 12
-    found = signed_distance(distance < 0)
+    found = signed_distance((distance < 0).float())
     assert torch.equal(found < 0, distance < 0)
     # Pixels know their border to half the diagonal.
     assert float((found - distance).abs().max()) < 0.75
 
 
 def test_signed_distance_without_a_border() -> None:
-    nothing = torch.zeros(5, 7, dtype=torch.bool)
+    nothing = torch.zeros(5, 7)
     assert torch.equal(signed_distance(nothing), torch.full((5, 7), 12.0))
-    assert torch.equal(signed_distance(~nothing), torch.full((5, 7), -12.0))
+    assert torch.equal(signed_distance(1 - nothing), torch.full((5, 7), -12.0))

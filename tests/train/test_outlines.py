@@ -27,7 +27,7 @@ def _frames(scale: float, shift: float) -> list[Frame]:
             Frame(
                 name=f"{number}",
                 image=torch.zeros(SIZE, SIZE, 3, dtype=torch.uint8),
-                mask=mask,
+                coverage=mask.byte() * 255,
                 camera=camera,
                 pose=HandPose(pose.rotations, pose.translation + torch.tensor([shift, 0, 0])),
                 confidence=0.9,

@@ -56,7 +56,8 @@ class Frame:
     Attributes:
         name: unique within the capture, e.g. ``000012``.
         image: sRGB, 8 bit, as stored; the background is kept.
-        mask: true on the hand.
+        coverage: how much of each pixel the hand covers, 255 for all of it; the pixels of an
+            outline are covered in part.
         camera: OpenCV axes, of exactly this picture.
         pose: one hand; rotations of 16 bones, translation in metres.
         confidence: how far the pose is to be trusted, in [0, 1].
@@ -66,12 +67,22 @@ class Frame:
 
     name: str
     image: UInt8[Tensor, "height width 3"]
-    mask: Bool[Tensor, "height width"]
+    coverage: UInt8[Tensor, "height width"]
     camera: Camera
     pose: HandPose
     confidence: float
     split: str
     time: float
+
+    @property
+    def mask(self) -> Bool[Tensor, "height width"]:
+        """True where the hand covers at least half of the pixel."""
+        return self.coverage > 127
+
+    @property
+    def alpha(self) -> Float[Tensor, "height width"]:
+        """The coverage in [0, 1]."""
+        return self.coverage.float() / 255
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +168,7 @@ class Capture:
         return Frame(
             name=record.name,
             image=torch.from_numpy(image),
-            mask=torch.from_numpy(mask > 127 if mask.dtype != bool else mask),
+            coverage=torch.from_numpy(mask if mask.dtype != bool else mask * np.uint8(255)),
             camera=record.camera,
             pose=record.pose,
             confidence=record.confidence,
@@ -494,8 +505,7 @@ class CaptureWriter:
                     f"frame {frame.name}: the {name} of its pose are not finite", "drop the frame"
                 )
         Image.fromarray(frame.image.cpu().numpy()).save(self.file(image_path))
-        mask = frame.mask.cpu().numpy().astype(np.uint8) * 255
-        Image.fromarray(mask).save(self.file(mask_path))
+        Image.fromarray(frame.coverage.cpu().numpy()).save(self.file(mask_path))
         camera = frame.camera
         self._entries.append(
             {

@@ -181,11 +181,14 @@ class HandMask:
 
     Attributes:
         pixels: true on skin that belongs to the hand or the forearm.
+        level: smooth, in [0, 1]; more than 0.5 on these pixels and nowhere else, so that its
+            contour at 0.5 is the border to a fraction of a pixel.
         quality: agreement (intersection over union) of the graph cut with the colour model
             alone, in [0, 1].
     """
 
     pixels: Bool[np.ndarray, "side side"]
+    level: Float[np.ndarray, "side side"]
     quality: float
 
 
@@ -253,12 +256,13 @@ def find_mask(hand: TrackedHand, colors: ColorModel) -> HandMask:
     labels[regions.core & (ratio > 0)] = _HAND
     cut = _graph_cut(hand.window.image, labels)
     is_sure = labels == _BACKGROUND
-    settled = settled_border(hand.window.image, _cleaned(cut, regions) & ~is_sure, is_sure)
-    cleaned = _cleaned(settled, regions)
+    level = settled_border(hand.window.image, _cleaned(cut, regions) & ~is_sure, is_sure)
+    cleaned = _cleaned(level > 0.5, regions)
+    level = np.where(cleaned == (level > 0.5), level, cleaned)
     reference = _cleaned(by_color, regions)
     union = (cleaned | reference) & regions.near
     agreement = (cleaned & reference & regions.near).sum() / max(1, int(union.sum()))
-    return HandMask(cleaned, float(agreement))
+    return HandMask(cleaned, level, float(agreement))
 
 
 def pixels_per_metre(hand: TrackedHand) -> float:
@@ -276,7 +280,7 @@ def settled_border(
     image: UInt8[np.ndarray, "side side 3"],
     mask: Bool[np.ndarray, "side side"],
     is_background: Bool[np.ndarray, "side side"],
-) -> Bool[np.ndarray, "side side"]:
+) -> Float[np.ndarray, "side side"]:
     """The mask with its border where the picture changes from skin to what is beside it.
 
     Videos store colour coarsely: its edges lie some pixels beside those of brightness, and a model
@@ -289,8 +293,12 @@ def settled_border(
         image: sRGB.
         mask: at most a few pixels wrong.
         is_background: what is certainly no skin.
+
+    Returns:
+        More than 0.5 on skin; falls smoothly across the border, in [0, 1].
     """
     pixels = image.astype(np.float32) @ _LUMA_AND_COLOR.T
+    level = mask.astype(np.float32)
     for _ in range(_BORDER_ROUNDS):
         depth = ndimage.distance_transform_edt(mask)
         height = ndimage.distance_transform_edt(~mask)
@@ -302,10 +310,11 @@ def settled_border(
         is_free = (depth <= _BORDER_REACH) & (height <= _BORDER_REACH) & ~is_background
         trust = np.where(is_free, contrast / (contrast + _BORDER_NOISE**2), 1.0)
         value = trust * np.where(is_free, share, mask) + _BORDER_INERTIA * mask
-        share = ndimage.gaussian_filter(value, _BORDER_SMOOTHING)
-        share /= ndimage.gaussian_filter(trust + _BORDER_INERTIA, _BORDER_SMOOTHING)
-        mask = np.where(is_free, share > 0.5, mask)
-    return mask
+        smooth = ndimage.gaussian_filter(value, _BORDER_SMOOTHING)
+        smooth /= ndimage.gaussian_filter(trust + _BORDER_INERTIA, _BORDER_SMOOTHING)
+        level = np.where(is_free, smooth, mask).clip(0, 1)
+        mask = level > 0.5
+    return level
 
 
 def _local_mean(

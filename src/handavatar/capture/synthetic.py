@@ -357,7 +357,7 @@ def _frames(
             frame = Frame(
                 name=f"{index:06d}",
                 image=_eight_bits(srgb_from_linear(color)),
-                mask=traced.alpha > 0.5,
+                coverage=_eight_bits(traced.alpha),
                 camera=camera,
                 pose=motion.pose(step),
                 confidence=1.0,

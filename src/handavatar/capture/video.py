@@ -43,6 +43,7 @@ Progress = Callable[[float, str], None]
 """Told the share of the work that is done, in [0, 1], and what is being done."""
 
 _BOX_SCALE = 1.3
+_SUBPIXELS = 3
 _WRIST_BAND = 0.020
 _WRIST_SLACK = 0.004
 _HELD_OUT = ((0.28, 0.08), (0.68, 0.08))
@@ -242,23 +243,31 @@ def _result(
     )
     zoom = np.eye(2) * (box / size)
     image = resampled(window.image, zoom, np.array(corner), size)
-    grey = np.repeat(mask.pixels[..., None] * np.uint8(255), 3, axis=-1)
-    full = resampled(grey, zoom, np.array(corner), size)[..., 0] > 127
-    mesh = silhouette(rig, vertices, camera)
-    scale = pixels_per_metre(hand) * window.scale * size / box
-    cut = _cut_mask(full, mesh, project(camera, vertices)[0].numpy(), rim, scale)
+    grey = np.repeat((255 * mask.level[..., None]).round().astype(np.uint8), 3, axis=-1)
+    fine = _SUBPIXELS * size
+    full = resampled(grey, zoom / _SUBPIXELS, np.array(corner), fine)[..., 0] > 127
+    fine_camera = camera.resized(fine, fine)
+    mesh = silhouette(rig, vertices, fine_camera)
+    scale = pixels_per_metre(hand) * window.scale * fine / box
+    cut = _cut_mask(full, mesh, project(fine_camera, vertices)[0].numpy(), rim, scale)
     iou = float((mesh & cut).sum() / max(1, int((mesh | cut).sum())))
     frame = Frame(
         name=f"{hand.index:06d}",
         image=torch.from_numpy(image.copy()),
-        mask=torch.from_numpy(cut),
+        coverage=torch.from_numpy((255 * _shares(cut)).round().astype(np.uint8)),
         camera=camera,
         pose=fit.pose(number),
         confidence=_confidence(hand, mask, iou, error_metres),
         split="train",
         time=hand.time,
     )
-    return FittedFrame(frame, mesh, iou, error_metres * scale)
+    return FittedFrame(frame, _shares(mesh) > 0.5, iou, error_metres * scale / _SUBPIXELS)
+
+
+def _shares(fine: Bool[np.ndarray, "fine fine"]) -> Float[np.ndarray, "side side"]:
+    """How much of each pixel is true, in [0, 1], of a mask of ``_SUBPIXELS`` times the size."""
+    side = len(fine) // _SUBPIXELS
+    return fine.reshape(side, _SUBPIXELS, side, _SUBPIXELS).mean(axis=(1, 3))
 
 
 def _confidence(hand: TrackedHand, mask: HandMask, iou: float, error_metres: float) -> float:

@@ -108,18 +108,24 @@ class JudgedFrame:
     Attributes:
         rendered: the avatar on black.
         rendered_mask: where the avatar covers at least half of the pixel.
-        truth: the photograph; its background is ignored.
-        truth_mask: where the photograph shows the hand.
+        truth: the photograph.
+        truth_coverage: how much of each pixel of the photograph the hand covers, in [0, 1]. Its
+            outline goes through pixels; black beside it is mixed in by as much.
     """
 
     rendered: Float[Tensor, "height width 3"]
     rendered_mask: Bool[Tensor, "height width"]
     truth: Float[Tensor, "height width 3"]
-    truth_mask: Bool[Tensor, "height width"]
+    truth_coverage: Float[Tensor, "height width"]
+
+    @property
+    def truth_mask(self) -> Bool[Tensor, "height width"]:
+        """Where the photograph shows more hand than background."""
+        return self.truth_coverage > 0.5
 
     def on_black(self) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
         """Both pictures as they are compared: the hand on black, 8 bit."""
-        return quantised(self.rendered), quantised(self.truth * self.truth_mask[..., None])
+        return quantised(self.rendered), quantised(self.truth * self.truth_coverage[..., None])
 
     def region(self) -> Bool[Tensor, "height width"]:
         """The union of both masks, dilated by ``REGION_MARGIN``.
@@ -222,22 +228,22 @@ def mean_color(
 def mean_color_masked_psnr(
     color: Float[Tensor, "3"],
     images: Sequence[Float[Tensor, "height width 3"]],
-    masks: Sequence[Bool[Tensor, "height width"]],
+    coverages: Sequence[Float[Tensor, "height width"]],
 ) -> float:
     """The baseline that knows the true mask and nothing else: one colour painted into it.
 
     Args:
         color: :func:`mean_color` of the training frames.
         images: the frames to be judged.
-        masks: their true masks.
+        coverages: their true masks; see :class:`JudgedFrame`.
 
     Returns:
         The masked protocol's PSNR, decibels.
     """
     return _mean(
         [
-            masked_psnr(JudgedFrame(color * mask[..., None], mask, image, mask))
-            for image, mask in zip(images, masks, strict=True)
+            masked_psnr(JudgedFrame(color * coverage[..., None], coverage > 0.5, image, coverage))
+            for image, coverage in zip(images, coverages, strict=True)
         ]
     )
 

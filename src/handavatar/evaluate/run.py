@@ -88,7 +88,7 @@ def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
                 rendering.color.clamp(0, 1),
                 rendering.alpha > 0.5,
                 frame.image.float() / 255,
-                frame.mask,
+                frame.alpha,
             )
         )
     metrics = _measured(options, capture, frames, renderings, judged)
@@ -102,7 +102,7 @@ def _aligned(avatar: HandAvatar, frame: Frame) -> HandPose:
     """Training corrects the poses of its own frames; held-out frames get the same chance."""
     device = avatar.device
     return aligned_pose(
-        avatar.coarse_personal, frame.pose.to(device), frame.camera.to(device), frame.mask
+        avatar.coarse_personal, frame.pose.to(device), frame.camera.to(device), frame.alpha
     )
 
 
@@ -159,7 +159,9 @@ def _measured(
         [frame.image.float() / 255 for frame in training], [frame.mask for frame in training]
     )
     baseline = mean_color_masked_psnr(
-        color, [frame.image.float() / 255 for frame in frames], [frame.mask for frame in frames]
+        color,
+        [frame.image.float() / 255 for frame in frames],
+        [frame.alpha for frame in frames],
     )
     return {
         "split": options.split,

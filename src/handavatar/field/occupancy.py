@@ -216,6 +216,7 @@ class PairOccupancy(nn.Module):
         margin: float = BOX_MARGIN,
         chunk: int = 1024,
         connections: tuple[tuple[int, int], ...] = CONNECTED_PAIRS,
+        sharpness: float = 1.0,
     ) -> None:
         """Builds an untrained field.
 
@@ -226,6 +227,10 @@ class PairOccupancy(nn.Module):
             chunk: points evaluated at a time without gradient.
             connections: the pairs of parts to decode, every part in one at least; others than
                 the physical ones serve as a control.
+            sharpness: the occupancy is the sigmoid of so many times the logit. A field trained on
+                points is as soft as it is unsure, and along a grazing ray the tail adds up to an
+                outline too wide; more than 1 takes the tail away and leaves the surface where it
+                is.
 
         Departs: the authors' boxes are twice the size of the part. A fixed margin gives fingers
             the same reach, and spares the wide empty space that doubling the palm encloses.
@@ -238,6 +243,7 @@ class PairOccupancy(nn.Module):
         self.margin = margin
         self.chunk = chunk
         self.connections = connections
+        self.sharpness = sharpness
         self.register_buffer("pairs", torch.tensor(connections), persistent=False)
 
     def encode(self, parts: Parts, posed: PosedHand) -> HandCodes:
@@ -279,7 +285,7 @@ class PairOccupancy(nn.Module):
         logits = self._decode(codes, points, items)
         slots = (items.points[:, None] * NUM_BONES + self.pairs[items.pairs])[items.is_wanted]
         parts = self.fusion.over_pairs(
-            logits[items.is_wanted], slots, len(points) * NUM_BONES, slope=1.0
+            logits[items.is_wanted], slots, len(points) * NUM_BONES, slope=self.sharpness
         )
         return self.fusion.over_parts(parts.view(-1, NUM_BONES))
 
@@ -301,7 +307,9 @@ class PairOccupancy(nn.Module):
         logits = self._decode(codes, points, items)[items.is_wanted]
         slots = (items.points[:, None] * NUM_BONES + self.pairs[items.pairs])[items.is_wanted]
         size = num_points * NUM_BONES
-        parts = self.fusion.over_pairs(logits, slots, size, slope=1.0).view(-1, NUM_BONES)
+        parts = self.fusion.over_pairs(logits, slots, size, slope=self.sharpness).view(
+            -1, NUM_BONES
+        )
         soft = self.fusion.over_pairs(logits, slots, size, self.softness).view(-1, NUM_BONES)
         return self.fusion.over_parts(parts), soft * box_fade(local, codes.boxes)
 
@@ -351,7 +359,9 @@ class PairOccupancy(nn.Module):
         answer_points = point_index[item_of_answer]
         slots = answer_points * NUM_BONES + members[is_wanted]
         size = num_points * NUM_BONES
-        parts = self.fusion.over_pairs(logits, slots, size, slope=1.0).view(-1, NUM_BONES)
+        parts = self.fusion.over_pairs(logits, slots, size, slope=self.sharpness).view(
+            -1, NUM_BONES
+        )
         soft = self.fusion.over_pairs(logits, slots, size, self.softness).view(-1, NUM_BONES)
         deciding = self.fusion.deciding(logits, answer_points, num_points)
         side = is_wanted.nonzero()[:, 1][deciding]

@@ -6,9 +6,10 @@ Image positions and distances in pixels, pixel centres at +0.5.
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_dilation, distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -96,19 +97,19 @@ def silhouette_loss(
 
 
 def soft_mask(
-    mask: Bool[Tensor, "height width"], size: int, softness: float = 1.0
+    coverage: Float[Tensor, "height width"], size: int, softness: float = 1.0
 ) -> Float[Tensor, "size size"]:
     """A mask with ``size`` pixels along a side, as :func:`soft_silhouette` would cover it.
 
     Args:
-        mask: true on the hand.
+        coverage: of each pixel by the hand, in [0, 1].
         size: pixels along a side of the result.
         softness: pixels of the result.
     """
     distance = interpolate(
-        signed_distance(mask)[None, None], (size, size), mode="bilinear", antialias=True
+        signed_distance(coverage)[None, None], (size, size), mode="bilinear", antialias=True
     )[0, 0]
-    distance = distance * (size / mask.shape[-1])
+    distance = distance * (size / coverage.shape[-1])
     return torch.sigmoid(-distance * distance.abs() / softness**2)
 
 
@@ -150,18 +151,27 @@ def outline_points(
     return OutlinePoints(pieces.ends, (pieces.low + pieces.high) / 2, (end - start).norm(dim=-1))
 
 
-def signed_distance(mask: Bool[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-    """Pixels from each pixel's centre to the border of a mask, negative inside.
+def signed_distance(coverage: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """Pixels from each pixel's centre to the outline of what covers them, negative inside.
 
-    A mask without a border is nowhere near: plus or minus the picture's size.
+    A pixel that is covered in part tells by how much where the outline passes it; with none such,
+    it runs between the pixels. Without an outline it is nowhere near: plus or minus the
+    picture's size.
+
+    Args:
+        coverage: in [0, 1].
     """
-    inside = mask.cpu().numpy()
+    covered = coverage.cpu().numpy()
+    inside = covered >= 0.5
     if inside.all() or not inside.any():
-        return torch.full(mask.shape, float(sum(mask.shape))) * (-1.0 if inside.any() else 1.0)
-    # Neighbours across the border are one apart, and it runs between them.
-    away = distance_transform_edt(~inside) - distance_transform_edt(inside)
-    distance = torch.from_numpy(away).float()
-    return (distance - 0.5 * distance.sign()).to(mask.device)
+        size = float(sum(coverage.shape))
+        return torch.full(coverage.shape, -size if inside.any() else size, device=coverage.device)
+    is_partial = (covered > 0) & (covered < 1)
+    is_known = is_partial | ((covered == 1) & binary_dilation(covered == 0))
+    away, nearest = distance_transform_edt(~is_known, return_indices=True)
+    passing = 0.5 - covered[tuple(nearest)]
+    distance = np.where(inside, passing - away, passing + away)
+    return torch.from_numpy(distance).to(coverage)
 
 
 @dataclass(frozen=True, eq=False)

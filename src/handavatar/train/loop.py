@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar, RenderSettings, chosen_device
@@ -29,6 +29,7 @@ from handavatar.train.optimizer_state import (
     restore_optimizer,
 )
 from handavatar.train.outlines import EdgeSet, corrected_pose, fit_outlines, shape_losses
+from handavatar.train.personal_occupancy import fit_occupancy
 from handavatar.train.prior import SHIPPED_PRIOR, load_prior
 from handavatar.train.progress import Progress
 from handavatar.train.runs import (
@@ -61,6 +62,9 @@ class Method:
         outline_rounds: before the first step, the poses of tracked captures and the shape are
             drawn in turn to the outlines of all frames, so many times (``train.outlines``).
         outline_visits: how often the shape sees every frame in one round.
+        personal_steps: after the outlines, before the first step, the pair decoder learns the
+            personal hand for so many steps (``train.personal_occupancy``).
+        sharpness: of the occupancy, from then on; see :class:`PairOccupancy`.
         warm_steps: the first steps fit albedo and illumination alone, on samples that are found
             once (``train.appearance``); later steps recall these.
         warm_pixels: pixels per such step and per recall, from all frames.
@@ -95,6 +99,8 @@ class Method:
     cues: PaperCues | OrientedCues = field(default_factory=PaperCues)
     outline_rounds: int = 3
     outline_visits: int = 3
+    personal_steps: int = 0
+    sharpness: float = 1.0
     warm_steps: int = 0
     warm_pixels: int = 2560
     warm_stride: int = 6
@@ -115,8 +121,10 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "quick": Method(
-        steps=400,
+        steps=360,
         cues=OrientedCues(),
+        personal_steps=500,
+        sharpness=2.0,
         warm_steps=300,
         frames=1,
         patches=1,
@@ -307,7 +315,7 @@ def _fit_or_restore_outlines(
     method: Method,
     options: TrainOptions,
 ) -> dict[str, Tensor]:
-    """Sets shape and poses as the outlines alone would have them, and returns these."""
+    """Sets shape, poses and decoder as the outlines alone would have them, and returns these."""
     modules = _outline_modules(training)
     if checkpoint is None:
         fit_outlines(
@@ -319,6 +327,10 @@ def _fit_or_restore_outlines(
             method.silhouette_size,
             options.seed,
         )
+        if method.personal_steps:
+            poses = [frame.pose for frame in _corrected(training, frames)]
+            fit_occupancy(training.avatar, poses, method.personal_steps, options.seed)
+        training.avatar.occupancy.sharpness = method.sharpness
         tensors = {
             f"{prefix}{name}": value.clone()
             for prefix, module in modules.items()
@@ -326,6 +338,7 @@ def _fit_or_restore_outlines(
         }
         _save(run, training, tensors, 0)
         return tensors
+    training.avatar.occupancy.sharpness = method.sharpness
     tensors = load_checkpoint(checkpoint).tensors["outlines"]
     for prefix, module in modules.items():
         module.load_state_dict(_named(tensors, prefix))
@@ -333,7 +346,10 @@ def _fit_or_restore_outlines(
 
 
 def _outline_modules(training: Training) -> dict[str, torch.nn.Module]:
-    modules: dict[str, torch.nn.Module] = {"shape.": training.avatar.shape}
+    modules: dict[str, torch.nn.Module] = {
+        "shape.": training.avatar.shape,
+        "decoder.": training.avatar.occupancy.decoder,
+    }
     if training.corrections is not None:
         modules["corrections."] = training.corrections
     return modules
@@ -341,13 +357,18 @@ def _outline_modules(training: Training) -> dict[str, torch.nn.Module]:
 
 def _seen_samples(training: Training, frames: list[Frame], method: Method) -> SeenSamples:
     settings = RenderSettings(num_samples=method.num_samples)
-    with torch.no_grad():
-        poses = [
-            corrected_pose(training.corrections, frame, number, training.avatar.device)
-            for number, frame in enumerate(frames)
-        ]
-    frames = [replace(frame, pose=pose) for frame, pose in zip(frames, poses, strict=True)]
-    return find_seen_samples(training.avatar, frames, settings, method.warm_stride)
+    corrected = _corrected(training, frames)
+    return find_seen_samples(training.avatar, corrected, settings, method.warm_stride)
+
+
+@torch.no_grad()
+def _corrected(training: Training, frames: list[Frame]) -> list[Frame]:
+    """The frames with their poses as training sees them."""
+    device = training.avatar.device
+    return [
+        replace(frame, pose=corrected_pose(training.corrections, frame, number, device))
+        for number, frame in enumerate(frames)
+    ]
 
 
 def _some_pixels(
@@ -429,7 +450,7 @@ def frame_losses(
     pose = corrected_pose(training.corrections, frame, number, device)
     state = avatar.prepare(pose)
     camera = frame.camera.to(device)
-    mask = soft_mask(frame.mask, method.silhouette_size).to(device)
+    mask = soft_mask(frame.alpha, method.silhouette_size).to(device)
     losses = shape_losses(state.posed, state.offsets, camera, mask, edges)
     if training.corrections is not None:
         losses["pose"] = 0.01 * training.corrections.penalty(number)
@@ -449,7 +470,7 @@ def frame_losses(
         patch_pixels(frame.mask, method.patch_size, method.patch_strides, generator)
         for _ in range(method.patches)
     ]
-    border = border_pixels(frame.mask, method.border_pixels, generator)
+    border = border_pixels(frame.alpha, method.border_pixels, generator)
     x, y = torch.cat([*patches, border]).unbind(-1)
     near = avatar.near_mesh(state, camera, settings.mask_margin)[y, x].nonzero()[:, 0]
     rays = rays_through_pixels(camera, pixel_centers(camera)[y, x][near])
@@ -457,16 +478,16 @@ def frame_losses(
     black = torch.zeros(len(x), device=device)
     alpha = black.index_copy(0, near, seen.alpha)
     color = black[:, None].repeat(1, 3).index_copy(0, near, seen.color)
-    is_hand = frame.mask[y, x].to(device)
+    coverage = frame.alpha[y, x].to(device)
     if len(border):
-        losses["border"] = border_loss(alpha[-len(border) :], is_hand[-len(border) :])
+        losses["border"] = border_loss(alpha[-len(border) :], coverage[-len(border) :])
 
     in_patches = slice(len(x) - len(border))
-    x, y, is_hand = x[in_patches], y[in_patches], is_hand[in_patches]
+    x, y, coverage = x[in_patches], y[in_patches], coverage[in_patches]
     color, alpha = color[in_patches], alpha[in_patches]
     background = torch.rand(3, generator=generator).to(device)
     truth = frame.image[y, x].to(device).float() / 255
-    truth = torch.where(is_hand[:, None], truth, background)
+    truth = background + coverage[:, None] * (truth - background)
     color = color + (1 - alpha[:, None]) * background
     losses["color"] = color_loss(color, truth)
     size = (method.patches, method.patch_size, method.patch_size)
@@ -520,13 +541,13 @@ def patch_pixels(
 
 
 def border_pixels(
-    mask: Bool[Tensor, "height width"], count: int, generator: torch.Generator
+    coverage: Float[Tensor, "height width"], count: int, generator: torch.Generator
 ) -> Int[Tensor, "pixels 2"]:
     """Pixels (x, y) at most ``BORDER_REACH`` from the border of the mask, drawn evenly.
 
     As many as asked for, or as there are.
     """
-    y, x = (signed_distance(mask).abs() < BORDER_REACH).nonzero().unbind(-1)
+    y, x = (signed_distance(coverage).abs() < BORDER_REACH).nonzero().unbind(-1)
     chosen = torch.randperm(len(x), generator=generator)[:count]
     return torch.stack([x[chosen], y[chosen]], dim=-1)
 

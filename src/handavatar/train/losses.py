@@ -30,14 +30,14 @@ def color_loss(
 
 
 def border_loss(
-    alpha: Float[Tensor, "pixels"], is_hand: Bool[Tensor, "pixels"]
+    alpha: Float[Tensor, "pixels"], coverage: Float[Tensor, "pixels"]
 ) -> Float[Tensor, ""]:
-    """Mean absolute error of what the hand covers, at pixels beside the mask's border.
+    """Mean absolute error of how much of a pixel the hand covers, beside the mask's border.
 
     Departs: the authors' occupancy learns its outline in the picture from colours alone, for which
         minutes are too short: it stays half a pixel off the mesh.
     """
-    return (alpha - is_hand.to(alpha)).abs().mean()
+    return (alpha - coverage).abs().mean()
 
 
 def offset_loss(

@@ -99,7 +99,7 @@ def fit_outlines(
     """
     generator = torch.Generator().manual_seed(seed)
     edges = EdgeSet.of(avatar.base_rig)
-    masks = [soft_mask(frame.mask, size) for frame in frames]
+    masks = [soft_mask(frame.alpha, size) for frame in frames]
     optimizer = torch.optim.Adam(avatar.shape.parameters(), lr=_RATE, betas=(0.9, 0.99))
     passes = rounds * visits + (rounds + 1 if corrections else 0) * (rounds > 0)
     steps = rounds * visits * -(-len(frames) // _BATCH)
@@ -157,7 +157,7 @@ def _align(
             avatar.coarse_personal,
             pose,
             frame.camera.to(avatar.device),
-            frame.mask,
+            frame.alpha,
             _ALIGNMENT_STEPS,
             start,
         )

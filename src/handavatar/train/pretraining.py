@@ -95,7 +95,7 @@ class OccupancyLoss(nn.Module):
             return self.field.of_items(codes, points[is_erring], items), target[is_erring]
 
 
-def prior_optimizers(field: OccupancyField) -> dict[str, torch.optim.Optimizer]:
+def prior_optimizers(field: nn.Module) -> dict[str, torch.optim.Optimizer]:
     """Muon for the matrices, Adam for all else; no rate is set yet.
 
     Departs: the authors use Adam alone, with which the same time on a CPU gains half as much.
