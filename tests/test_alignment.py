@@ -26,7 +26,7 @@ def _overlap(a: Tensor, b: Tensor) -> float:
 
 
 def _aligned(avatar: HandAvatar, pose: HandPose, mask: Tensor, steps: int = 8) -> HandPose:
-    return aligned_pose(avatar.coarse_personal, pose, camera_above(SIZE), mask, steps)
+    return aligned_pose(avatar.coarse_personal, pose, camera_above(SIZE), mask.float(), steps)
 
 
 def test_a_moved_and_bent_pose_is_pulled_back_onto_the_mask(small_avatar: HandAvatar) -> None:
@@ -73,4 +73,4 @@ def test_a_mask_far_away_or_empty_changes_little(small_avatar: HandAvatar) -> No
 def test_it_is_given_no_colours() -> None:
     """What is not handed over cannot be used: mask and camera, but neither frame nor image."""
     names = list(inspect.signature(aligned_pose).parameters)
-    assert names == ["hand_of", "pose", "camera", "mask", "steps", "start"]
+    assert names == ["hand_of", "pose", "camera", "coverage", "steps", "start"]

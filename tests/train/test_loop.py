@@ -364,8 +364,8 @@ def test_patches_are_square_grids_inside_the_picture_and_mostly_on_the_hand() ->
 
 
 def test_border_pixels_lie_beside_the_border_and_nowhere_else() -> None:
-    mask = torch.zeros(40, 40, dtype=torch.bool)
-    mask[10:30, 10:30] = True
+    mask = torch.zeros(40, 40)
+    mask[10:30, 10:30] = 1
     generator = torch.Generator().manual_seed(0)
     x, y = border_pixels(mask, 5000, generator).unbind(-1)
     outside = torch.maximum((x - 19.5).abs(), (y - 19.5).abs()) - 10
@@ -373,7 +373,7 @@ def test_border_pixels_lie_beside_the_border_and_nowhere_else() -> None:
     # Four pixels on either side of twenty: about 8 times 80, corners aside, each once.
     assert 560 < len(x) < 720 and len(torch.unique(x * 40 + y)) == len(x)
     assert len(border_pixels(mask, 100, generator)) == 100
-    assert len(border_pixels(torch.zeros(9, 9, dtype=torch.bool), 10, generator)) == 0
+    assert len(border_pixels(torch.zeros(9, 9), 10, generator)) == 0
 
 
 def test_an_empty_mask_gives_the_middle() -> None:

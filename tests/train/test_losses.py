@@ -60,8 +60,8 @@ def test_gradients_agree_with_finite_differences() -> None:
 
 
 def test_the_border_loss_is_the_share_of_wrongly_covered_pixels() -> None:
-    is_hand = torch.tensor([True, True, False, False])
-    assert float(border_loss(is_hand.float(), is_hand)) == 0
+    is_hand = torch.tensor([1.0, 1.0, 0.0, 0.0])
+    assert float(border_loss(is_hand, is_hand)) == 0
     assert float(border_loss(torch.tensor([1.0, 0.5, 0.25, 0.0]), is_hand)) == pytest.approx(0.1875)
     alpha = torch.tensor([0.7, 0.2, 0.4, 0.1], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda a: border_loss(a, is_hand), alpha)
