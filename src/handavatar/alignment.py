@@ -21,7 +21,7 @@ from handavatar.render.silhouette import OutlinePoints, outline_points, signed_d
 
 # Of the picture's width: how far apart outline and border are in a good fit, and how far apart
 # they may be before something else than the pose is at fault.
-_EXPECTED = 0.7 / 256
+_EXPECTED = 0.4 / 256
 _OUTLIER = 1.5 / 256
 # Neighbouring points err together: the whole outline says as much as so many independent ones.
 _INDEPENDENT_POINTS = 200

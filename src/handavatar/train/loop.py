@@ -121,11 +121,12 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "quick": Method(
-        steps=360,
+        steps=1220,
         cues=OrientedCues(),
-        personal_steps=500,
+        personal_steps=600,
         sharpness=2.0,
-        warm_steps=300,
+        warm_steps=1200,
+        warm_stride=4,
         frames=1,
         patches=1,
         patch_size=32,
