@@ -131,6 +131,25 @@ def test_the_fast_evaluation_equals_the_plain_one(
     assert 0.1 < float((whole > 0).float().mean()) < 0.95
 
 
+def test_a_sharper_field_has_the_same_surface_and_a_shorter_tail(rig: Rig, parts: Parts) -> None:
+    posed = any_pose(rig)
+    points = _points(posed)
+    field = _field()
+    codes = field.encode(parts, posed)
+    soft = field(codes, points)
+    field.sharpness = 3.0
+    sharp = field(codes, points)
+    torch.testing.assert_close(sharp.whole.logit(), 3 * soft.whole.logit(), rtol=1e-3, atol=1e-3)
+    assert bool(((sharp.whole > 0.5) == (soft.whole > 0.5)).all())
+    # Directed soft occupancy is the prior's own: what the illumination depends on stays.
+    assert torch.equal(sharp.soft_parts, soft.soft_parts)
+    plain, _ = field.plain(codes, points)
+    torch.testing.assert_close(sharp.whole, plain, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        field.of_items(codes, points, sharp.items), plain, rtol=1e-4, atol=1e-5
+    )
+
+
 def test_the_gradient_through_the_winning_pairs_is_the_whole_gradient(
     rig: Rig, parts: Parts
 ) -> None:

@@ -118,20 +118,31 @@ def test_a_step_changes_all_but_the_frozen_encoder(tiny_capture: Path) -> None:
 
 
 def test_warm_steps_leave_the_occupancy_alone(whole_run: Path) -> None:
-    checkpoints = [
-        load_checkpoint(checkpoint).tensors["model"]
-        for checkpoint in (
-            Checkpoint(whole_run / "checkpoints" / f"step-{step:09d}", step) for step in (2, 4)
-        )
-    ]
-    before = load_file(SHIPPED_PRIOR)
-    for name, value in before.items():
-        if name.startswith("decoder"):
-            assert torch.equal(checkpoints[0][f"avatar.occupancy.{name}"], value)
-    changed = [name for name in before if name.startswith("decoder.mlp")]
-    assert not all(
-        torch.equal(checkpoints[1][f"avatar.occupancy.{name}"], before[name]) for name in changed
+    warm, joint = (
+        load_checkpoint(Checkpoint(whole_run / "checkpoints" / f"step-{step:09d}", step)).tensors
+        for step in (2, 4)
     )
+    outlines = {n: v for n, v in warm["outlines"].items() if n.startswith("decoder.")}
+    for name, value in outlines.items():
+        assert torch.equal(warm["model"][f"avatar.occupancy.{name}"], value), name
+    changed = [name for name in outlines if name.startswith("decoder.mlp")]
+    assert not all(
+        torch.equal(joint["model"][f"avatar.occupancy.{name}"], outlines[name]) for name in changed
+    )
+
+
+def test_the_outlines_keep_the_encoder_and_teach_the_decoder(whole_run: Path) -> None:
+    checkpoint = latest_checkpoint(open_run(whole_run))
+    assert checkpoint is not None
+    tensors = load_checkpoint(checkpoint).tensors
+    outlines, prior = tensors["outlines"], load_file(SHIPPED_PRIOR)
+    encoder = {n: v for n, v in prior.items() if n.startswith("encoder.")}
+    for name, value in encoder.items():
+        assert torch.equal(tensors["model"][f"avatar.occupancy.{name}"], value), name
+    decoder = {n: v for n, v in prior.items() if n.startswith("decoder.")}
+    assert decoder and decoder.keys() <= outlines.keys()
+    assert HandAvatar.load(whole_run / "avatar.safetensors").occupancy.sharpness == TINY.sharpness
+    assert not all(torch.equal(outlines[name], value) for name, value in decoder.items())
     logged = read_log(open_run(whole_run))
     assert ["perceptual" in record for record in logged] == [False] * 3 + [True] * 3
     assert ["silhouette" in record for record in logged] == [False] * 3 + [True] * 3
