@@ -6,22 +6,25 @@ the unknowns are all joint rotations and the translation.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.func import jacfwd
 
 from handavatar.geometry.cameras import Camera, project
-from handavatar.hand.pose import HandPose, bone_transforms, linear_blend_skinning
+from handavatar.hand.pose import (
+    HandPose,
+    bone_transforms,
+    linear_blend_skinning,
+    skinning_jacobian,
+)
 from handavatar.hand.rig import ShapedHand
 from handavatar.render.rasterize import rasterize
 from handavatar.render.silhouette import OutlinePoints, outline_points, signed_distance
 
 # Of the picture's width: how far apart outline and border are in a good fit, and how far apart
 # they may be before something else than the pose is at fault.
-_EXPECTED = 0.4 / 256
+_EXPECTED = 0.5 / 256
 _OUTLIER = 1.5 / 256
 # Neighbouring points err together: the whole outline says as much as so many independent ones.
 _INDEPENDENT_POINTS = 200
@@ -41,8 +44,8 @@ def aligned_pose(
 ) -> HandPose:
     """A pose, moved a little so that the outline of the hand lies on the border of the mask.
 
-    Where the mesh ends at the wrist, the mask was cut by a mesh too: nothing is asked of these
-    points. The result covers the mask at least as well as what it began with.
+    Where the mesh ends at the wrist, the mask was cut as the tracked pose had it, and this border
+    counts like any other. The result covers the mask at least as well as what it began with.
 
     Args:
         hand_of: the rest hand of a pose.
@@ -61,7 +64,7 @@ def aligned_pose(
     first = found
     for _ in range(steps):
         hand = hand_of(found)
-        points = _usable_points(hand, found, camera)
+        points = outline_points(hand.posed(found).vertices, hand.rig.faces, camera)
         if len(points.ends) == 0:
             return first
         found = _stepped(hand, points, pose, found, camera, distance)
@@ -85,16 +88,18 @@ def _stepped(
     rest = points.of(hand.rest_vertices + hand.rig.pose_offsets(current.rotations))
     weights = points.of(hand.rig.skin_weights)
 
-    def seen(values: Float[Tensor, "unknowns"]) -> Float[Tensor, "points 2"]:
-        rotations, translation = values[:-3].reshape(-1, 3), values[-3:]
-        transforms = bone_transforms(rotations, hand.rest_joints)
+    transforms = bone_transforms(current.rotations, hand.rest_joints)
+    turning = skinning_jacobian(rest, weights, current.rotations, transforms, hand.rest_joints)
+    with torch.enable_grad():
         placed = linear_blend_skinning(rest, weights, transforms, hand.rest_joints)
-        return project(camera, placed + translation)[0]
-
+        placed = (placed + current.translation).requires_grad_()
+        pixels = project(camera, placed)[0]
+        residuals, slope = _sampled(distance, pixels.detach())
+        # A pixel depends on its own point alone: one gradient of the sum has them all.
+        (moving,) = torch.autograd.grad((pixels * slope).sum(), placed)
+    turning = torch.einsum("pc,pcbk->pbk", moving, turning).flatten(1)
+    jacobian = torch.cat([turning, moving], dim=1)
     values = torch.cat([current.rotations.flatten(), current.translation])
-    pixels = seen(values)
-    residuals, slope = _sampled(distance, pixels)
-    jacobian = torch.einsum("pi,piu->pu", slope, jacfwd(seen)(values))
     # Geman and McClure's weights: what is far off has its own reasons.
     scale = camera.width * torch.tensor([_EXPECTED, _OUTLIER], device=values.device)
     trust = points.lengths / points.lengths.sum() * _INDEPENDENT_POINTS
@@ -114,19 +119,6 @@ def _prior(size: int, camera: Camera) -> Float[Tensor, "unknowns unknowns"]:
     spread = torch.tensor(_TRANSLATION_ERROR, device=rotation.device)
     prior[-3:, -3:] = rotation.T @ torch.diag(spread**-2) @ rotation
     return prior
-
-
-def _usable_points(hand: ShapedHand, pose: HandPose, camera: Camera) -> OutlinePoints:
-    points = outline_points(hand.posed(pose).vertices, hand.rig.faces, camera)
-    is_rim = torch.zeros(hand.rig.num_vertices, dtype=torch.bool, device=points.ends.device)
-    is_rim[hand.rig.rim] = True
-    is_used = ~is_rim[points.ends].all(-1)
-    return replace(
-        points,
-        ends=points.ends[is_used],
-        ratio=points.ratio[is_used],
-        lengths=points.lengths[is_used],
-    )
 
 
 def _smoothed(distance: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:

@@ -10,6 +10,7 @@ from handavatar.geometry.rotations import (
     apply_rigid,
     axis_angle_from_matrix,
     invert_rigid,
+    left_jacobian,
     matrix_from_axis_angle,
     quaternion_from_matrix,
     rigid_transform,
@@ -67,6 +68,20 @@ def test_the_gradient_is_right_at_every_angle(angle: float) -> None:
     axis = torch.tensor([0.6, -0.64, 0.48], dtype=torch.float64)
     axis_angle = (angle * axis).requires_grad_()
     assert torch.autograd.gradcheck(matrix_from_axis_angle, (axis_angle,), eps=1e-7, atol=1e-6)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-5, 0.0099, 0.0101, 1.0, 3.0])
+def test_the_left_jacobian_is_what_a_small_change_turns_by(angle: float) -> None:
+    axis = torch.nn.functional.normalize(torch.tensor([0.3, -0.7, 0.5]).double(), dim=0)
+
+    def spin(change: torch.Tensor) -> torch.Tensor:
+        turned = matrix_from_axis_angle(angle * axis + change)
+        return turned @ matrix_from_axis_angle(angle * axis).T
+
+    slope = torch.func.jacrev(spin)(torch.zeros(3).double())
+    expected = torch.stack([slope[2, 1], slope[0, 2], slope[1, 0]])
+    found = left_jacobian(angle * axis)
+    torch.testing.assert_close(found, expected, rtol=1e-8, atol=1e-8)
 
 
 def test_skew_is_the_cross_product() -> None:

@@ -1,5 +1,6 @@
 """Bone transforms and skinning: laws, and the slow loop over bones and vertices."""
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -14,6 +15,7 @@ from handavatar.hand.pose import (
     HandPose,
     bone_transforms,
     linear_blend_skinning,
+    skinning_jacobian,
 )
 
 
@@ -134,6 +136,22 @@ def test_the_gradient_of_skinning() -> None:
     # At the flat hand every angle is zero, the delicate point of Rodrigues' formula.
     flat = torch.zeros(NUM_BONES, 3, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(skinned, (flat, rest))
+
+
+@pytest.mark.parametrize("size", [0.0, 0.4, 2.5])
+def test_the_skinning_jacobian_is_that_of_automatic_differentiation(size: float) -> None:
+    hand = load_open_hand("778").shaped()
+    generator = torch.Generator().manual_seed(5)
+    rotations = size * torch.randn(NUM_BONES, 3, generator=generator, dtype=torch.float64)
+    rest, joints = hand.rest_vertices[::9].double(), hand.rest_joints.double()
+    weights = hand.rig.skin_weights[::9].double()
+
+    def posed(values: Tensor) -> Tensor:
+        return linear_blend_skinning(rest, weights, bone_transforms(values, joints), joints)
+
+    transforms = bone_transforms(rotations, joints)
+    found = skinning_jacobian(rest, weights, rotations, transforms, joints)
+    torch.testing.assert_close(found, torch.func.jacfwd(posed)(rotations), rtol=1e-8, atol=1e-10)
 
 
 def test_the_bone_tree_is_five_chains_on_a_wrist() -> None:

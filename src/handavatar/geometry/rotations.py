@@ -46,6 +46,26 @@ def matrix_from_axis_angle(axis_angle: Float[Tensor, "*batch 3"]) -> Float[Tenso
     )
 
 
+def left_jacobian(axis_angle: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """What a small change of the axis-angle turns by: ``R(a + d) = R(left_jacobian(a) @ d) R(a)``.
+
+    Args:
+        axis_angle: rotation axis times angle, radians.
+
+    Returns:
+        Matrices from changes of axis-angle to rotations, both in radians, to first order.
+    """
+    squared = (axis_angle * axis_angle).sum(-1)
+    is_small = squared < 1e-4
+    safe = torch.where(is_small, torch.ones_like(squared), squared)
+    angle = safe.sqrt()
+    first = torch.where(is_small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
+    second = torch.where(is_small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle))
+    cross = skew(axis_angle)
+    identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
+    return identity + first[..., None, None] * cross + second[..., None, None] * (cross @ cross)
+
+
 def axis_angle_from_matrix(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
     """Inverse of :func:`matrix_from_axis_angle`, angles in [0, pi].
 

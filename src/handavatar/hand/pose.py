@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from handavatar.geometry.rotations import matrix_from_axis_angle, rigid_transform
+from handavatar.geometry.rotations import left_jacobian, matrix_from_axis_angle, rigid_transform
 
 BONE_NAMES: tuple[str, ...] = (
     "wrist",
@@ -101,3 +101,48 @@ def linear_blend_skinning(
     per_vertex = skin_weights @ motion
     blended = per_vertex[..., :9].unflatten(-1, (3, 3))
     return (blended @ rest_vertices[..., None])[..., 0] + per_vertex[..., 9:]
+
+
+def skinning_jacobian(
+    rest_vertices: Float[Tensor, "vertices 3"],
+    skin_weights: Float[Tensor, "vertices bones"],
+    rotations: Float[Tensor, "bones 3"],
+    world_from_bone: Float[Tensor, "bones 4 4"],
+    rest_joints: Float[Tensor, "bones 3"],
+) -> Float[Tensor, "vertices 3 bones 3"]:
+    """How posed vertices move with the joint rotations, metres per radian.
+
+    Bone ``j`` carries what it and the bones behind it carry around its own joint; so no automatic
+    differentiation is needed, and threads may share the work.
+
+    Args:
+        rest_vertices: as for :func:`linear_blend_skinning`.
+        skin_weights: as there.
+        rotations: axis-angle, radians.
+        world_from_bone: of these rotations, from :func:`bone_transforms`.
+        rest_joints: metres.
+
+    Returns:
+        For each component of a vertex, its change with each component of each axis-angle.
+    """
+    turned, joints = world_from_bone[:, :3, :3], world_from_bone[:, :3, 3]
+    parents = turned[list(BONE_PARENTS)].clone()
+    parents[0] = torch.eye(3, dtype=turned.dtype, device=turned.device)
+    axes = parents @ left_jacobian(rotations)
+    arms = rest_vertices[:, None] - rest_joints
+    weighted = (turned @ arms[..., None])[..., 0] + joints
+    weighted = weighted * skin_weights[..., None]
+    behind = turned.new_tensor(_BEHIND)
+    lever = torch.einsum("jb,vbc->vjc", behind, weighted)
+    lever = lever - (skin_weights @ behind.T)[..., None] * joints
+    turning = axes.mT[None].expand(len(lever), -1, -1, -1)
+    return torch.linalg.cross(turning, lever[:, :, None]).permute(0, 3, 1, 2)
+
+
+def _chain(bone: int) -> list[int]:
+    """A bone and those before it, up to the wrist."""
+    return [] if bone < 0 else [bone, *_chain(BONE_PARENTS[bone])]
+
+
+_BEHIND = [[float(j in _chain(b)) for b in range(NUM_BONES)] for j in range(NUM_BONES)]
+"""Row ``j``: one for bone ``j`` itself and for those that hang on it."""

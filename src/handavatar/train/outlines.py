@@ -14,6 +14,7 @@ from handavatar.alignment import aligned_pose
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
 from handavatar.field.shape import personal_hand
+from handavatar.field.threads import mapped
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import unique_edges
 from handavatar.hand.pose import HandPose
@@ -28,6 +29,7 @@ _BATCH = 4
 _RATE = 4e-3
 # Gauss-Newton steps per frame and round.
 _ALIGNMENT_STEPS = 4
+_ALIGNED_AT_ONCE = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,23 +114,11 @@ def fit_outlines(
             for _ in range(visits):
                 order = torch.randperm(len(frames), generator=generator)
                 for chosen in order.split(_BATCH):
-                    optimizer.zero_grad()
-                    values = [
-                        _backward(
-                            avatar,
-                            corrections,
-                            frames[number],
-                            masks[number].to(avatar.device),
-                            number,
-                            edges,
-                            len(chosen),
-                        )
-                        for number in chosen.tolist()
-                    ]
+                    value = _shape_step(avatar, corrections, frames, masks, edges, chosen.tolist())
                     optimizer.step()
                     falling.step()
                     done += len(chosen)
-                    progress.update(done, silhouette=sum(values) / len(values))
+                    progress.update(done, silhouette=value)
         if corrections is not None and rounds > 0:
             _align(avatar, corrections, frames, progress, done)
     optimizer.zero_grad(set_to_none=True)
@@ -149,38 +139,50 @@ def _align(
     progress: Progress,
     done: int,
 ) -> int:
-    for number, frame in enumerate(frames):
+    def align(number: int) -> None:
+        frame = frames[number]
         pose = frame.pose.to(avatar.device)
-        with torch.no_grad():
-            start = corrections(number, pose)
         found = aligned_pose(
             avatar.coarse_personal,
             pose,
             frame.camera.to(avatar.device),
             frame.alpha,
             _ALIGNMENT_STEPS,
-            start,
+            corrections(number, pose),
         )
         corrections.set(number, pose, found)
-        progress.update(done + number + 1)
-    return done + len(frames)
+
+    for numbers in torch.arange(len(frames)).split(_ALIGNED_AT_ONCE):
+        mapped(align, numbers.tolist())
+        done += len(numbers)
+        progress.update(done)
+    return done
 
 
-def _backward(
+def _shape_step(
     avatar: HandAvatar,
     corrections: PoseCorrections | None,
-    frame: Frame,
-    mask: Float[Tensor, "size size"],
-    number: int,
+    frames: list[Frame],
+    masks: list[Float[Tensor, "size size"]],
     edges: EdgeSet,
-    share: int,
+    chosen: list[int],
 ) -> float:
-    """Adds one frame's gradient to that of the shape; returns its silhouette loss."""
-    with torch.no_grad():
+    """Sets the gradient of the shape to that of some frames; returns their silhouette loss."""
+    parameters = list(avatar.shape.parameters())
+
+    def differentiated(number: int) -> tuple[tuple[Tensor, ...], float]:
+        frame = frames[number]
         pose = corrected_pose(corrections, frame, number, avatar.device)
-    rest = avatar.base_rig.shaped(avatar.coefficients)
-    offsets = avatar.shape(rest, pose.rotations)
-    camera = frame.camera.to(avatar.device)
-    losses = shape_losses(personal_hand(rest, offsets).posed(pose), offsets, camera, mask, edges)
-    (torch.stack(list(losses.values())).sum() / share).backward()
-    return float(losses["silhouette"].detach())
+        camera, mask = frame.camera.to(avatar.device), masks[number].to(avatar.device)
+        with torch.enable_grad():
+            rest = avatar.base_rig.shaped(avatar.coefficients)
+            offsets = avatar.shape(rest, pose.rotations)
+            posed = personal_hand(rest, offsets).posed(pose)
+            losses = shape_losses(posed, offsets, camera, mask, edges)
+            gradient = torch.autograd.grad(torch.stack(list(losses.values())).sum(), parameters)
+        return gradient, float(losses["silhouette"].detach())
+
+    gradients, values = zip(*mapped(differentiated, chosen), strict=True)
+    for parameter, parts in zip(parameters, zip(*gradients, strict=True), strict=True):
+        parameter.grad = torch.stack(parts).mean(0)
+    return sum(values) / len(values)
