@@ -24,7 +24,7 @@ from handavatar.render.silhouette import OutlinePoints, outline_points, signed_d
 
 # Of the picture's width: how far apart outline and border are in a good fit, and how far apart
 # they may be before something else than the pose is at fault.
-_EXPECTED = 0.5 / 256
+_EXPECTED = 0.4 / 256
 _OUTLIER = 1.5 / 256
 # Neighbouring points err together: the whole outline says as much as so many independent ones.
 _INDEPENDENT_POINTS = 200
@@ -39,7 +39,7 @@ def aligned_pose(
     pose: HandPose,
     camera: Camera,
     coverage: Float[Tensor, "height width"],
-    steps: int = 8,
+    steps: int = 16,
     start: HandPose | None = None,
 ) -> HandPose:
     """A pose, moved a little so that the outline of the hand lies on the border of the mask.

@@ -97,7 +97,7 @@ class Method:
     num_samples: int
     silhouette_size: int
     cues: PaperCues | OrientedCues = field(default_factory=PaperCues)
-    outline_rounds: int = 3
+    outline_rounds: int = 6
     outline_visits: int = 3
     personal_steps: int = 0
     sharpness: float = 1.0

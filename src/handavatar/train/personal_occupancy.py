@@ -6,23 +6,39 @@ known, tell it more for the same time than rays do.
 """
 
 import math
+from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
 from handavatar.avatar import HandAvatar
+from handavatar.field.occupancy import HandCodes
+from handavatar.field.threads import mapped
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.pose import HandPose
-from handavatar.hand.rig import PosedHand
-from handavatar.train.labelled_poses import LabelledPose, training_points
+from handavatar.train.labelled_poses import training_points
 from handavatar.train.pretraining import OccupancyLoss, learning_rate, prior_optimizers, set_rate
 from handavatar.train.progress import Progress
 from handavatar.train.stage_times import StageTimes
 
-_POINTS = 2048
+# Hands per step, points of each that a step draws, and points of each there are.
+_HANDS = 2
+_POINTS = 1024
+_POOL = 8192
 _RATE = 1e-3
 _LAST_RATE = 1e-5
 # Radians, at most: poses between and beside those of the training frames.
 _POSE_NOISE = 0.08
+
+
+@dataclass(frozen=True, eq=False)
+class _KnownHand:
+    """A personal hand in one pose, encoded, with points whose label is known."""
+
+    codes: HandCodes
+    points: Float[Tensor, "points 3"]
+    is_inside: Bool[Tensor, "points"]
 
 
 def fit_occupancy(avatar: HandAvatar, poses: list[HandPose], steps: int, seed: int) -> None:
@@ -31,7 +47,7 @@ def fit_occupancy(avatar: HandAvatar, poses: list[HandPose], steps: int, seed: i
     Args:
         avatar: only its pair decoder changes.
         poses: of the training frames, as the outlines have them.
-        steps: of one pose and ``_POINTS`` labelled points each.
+        steps: of ``_HANDS`` hands and ``_POINTS`` labelled points of each.
         seed: of poses and points.
 
     Source: paper Sec. 3.2, L_PairOF, which the paper takes along in every step of the training.
@@ -44,12 +60,18 @@ def fit_occupancy(avatar: HandAvatar, poses: list[HandPose], steps: int, seed: i
     generator = torch.Generator().manual_seed(seed)
     average = math.nan
     with Progress("occupancy", steps) as progress:
+        # Hands and labels cost as much as a step: once for all steps, one of every pose.
+        hands = _known_hands(avatar, poses if steps else [], seed)
         for step in range(1, steps + 1):
             set_rate(optimizers, learning_rate(step, steps, _RATE, _LAST_RATE))
-            sample = _labelled(avatar, _varied(poses, generator), generator)
             for optimizer in optimizers.values():
                 optimizer.zero_grad(set_to_none=True)
-            loss = loss_of([sample])
+            losses = []
+            for number in torch.randint(len(hands), (_HANDS,), generator=generator).tolist():
+                hand = hands[number]
+                some = torch.randint(_POOL, (_POINTS,), generator=generator).to(avatar.device)
+                losses.append(loss_of.of_codes(hand.codes, hand.points[some], hand.is_inside[some]))
+            loss = torch.stack(losses).mean()
             loss.backward()
             for optimizer in optimizers.values():
                 optimizer.step()
@@ -59,18 +81,21 @@ def fit_occupancy(avatar: HandAvatar, poses: list[HandPose], steps: int, seed: i
     field.zero_grad(set_to_none=True)
 
 
-def _varied(poses: list[HandPose], generator: torch.Generator) -> HandPose:
-    """One of the poses, every joint turned a little."""
-    pose = poses[int(torch.randint(len(poses), (), generator=generator))]
+def _known_hands(avatar: HandAvatar, poses: list[HandPose], seed: int) -> list[_KnownHand]:
+    def known(number: int) -> _KnownHand:
+        generator = torch.Generator().manual_seed(seed * 1_000_003 + number)
+        pose = _varied(poses[number], generator)
+        posed = avatar.personal(pose).posed(pose)
+        points = training_points(avatar.parts, posed, _POOL, avatar.occupancy.margin, generator)
+        points = points.to(avatar.device)
+        labels = is_inside(posed.sealed_vertices, avatar.rig.sealed_faces, points)
+        return _KnownHand(avatar.occupancy.encode(avatar.parts, posed), points, labels)
+
+    return mapped(known, range(len(poses)))
+
+
+def _varied(pose: HandPose, generator: torch.Generator) -> HandPose:
+    """The pose, every joint turned a little."""
     size = _POSE_NOISE * float(torch.rand((), generator=generator))
     noise = size * torch.randn(pose.rotations.shape, generator=generator)
     return HandPose(pose.rotations + noise.to(pose.rotations), pose.translation)
-
-
-@torch.no_grad()
-def _labelled(avatar: HandAvatar, pose: HandPose, generator: torch.Generator) -> LabelledPose:
-    posed: PosedHand = avatar.personal(pose).posed(pose)
-    points = training_points(avatar.parts, posed, _POINTS, avatar.occupancy.margin, generator)
-    points = points.to(avatar.device)
-    labels = is_inside(posed.sealed_vertices, avatar.rig.sealed_faces, points)
-    return LabelledPose(posed, points, labels)

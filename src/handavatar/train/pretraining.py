@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from handavatar.avatar import CheckpointError
@@ -67,15 +67,21 @@ class OccupancyLoss(nn.Module):
         Departs: cross entropy instead of the mean squared error, whose gradient vanishes where a
             saturated sigmoid errs; points without a noticeable error are left out.
         """
-        loss = torch.zeros((), device=self.parts.barycentric.device)
+        losses = []
         for sample in samples:
-            posed, points = _moved(sample.posed, loss.device), sample.points.to(loss.device)
+            device = self.parts.barycentric.device
             with self.times.stage("encode"):
-                codes = self.field.encode(self.parts, posed)
-            predicted, target = self._erring(codes, points, sample.is_inside.to(points))
-            total = nn.functional.binary_cross_entropy(predicted, target, reduction="sum")
-            loss = loss + total / (len(points) * len(samples))
-        return loss
+                codes = self.field.encode(self.parts, _moved(sample.posed, device))
+            losses.append(self.of_codes(codes, sample.points.to(device), sample.is_inside))
+        return torch.stack(losses).mean()
+
+    def of_codes(
+        self, codes: HandCodes, points: Float[Tensor, "points 3"], is_inside: Bool[Tensor, "points"]
+    ) -> Float[Tensor, ""]:
+        """The same for one hand that is encoded already."""
+        predicted, target = self._erring(codes, points, is_inside.to(points))
+        total = nn.functional.binary_cross_entropy(predicted, target, reduction="sum")
+        return total / len(points)
 
     def _erring(
         self, codes: HandCodes, points: Float[Tensor, "points 3"], target: Float[Tensor, "points"]
