@@ -331,30 +331,36 @@ class HandAvatar(nn.Module):
         generator: torch.Generator | None = None,
     ) -> VisibleSamples:
         """The samples that weigh something in their ray; see :meth:`render_rays`."""
-        boxes = state.codes.boxes
-        near, far, is_hit = intervals_through_boxes(
-            rays, boxes.bone_from_world, boxes.lower - boxes.margin, boxes.upper + boxes.margin
-        )
-        hit = is_hit.nonzero()[:, 0]
-        depths = depths_along(near[hit], far[hit], settings.num_samples, generator)
-        rays_hit = Rays(rays.origins[hit], rays.directions[hit])
-        weights, kept, directed = self._weighed(state, rays_hit, depths, settings)
+        hit, rays_hit, depths = _sampled(state.codes, rays, settings, generator)
+        weights, kept, directed = self._weighed(state.codes, rays_hit, depths, settings)
         ray, sample = kept.unbind(-1)
         along = depths[ray, sample]
         points = rays_hit.origins[ray] + along[:, None] * rays_hit.directions[ray]
         neighbours = nearest_anchors(state.anchors, points)
         return VisibleSamples(weights, hit[ray], along, directed, neighbours)
 
+    def alpha(
+        self,
+        codes: HandCodes,
+        rays: Rays,
+        settings: RenderSettings,
+        generator: torch.Generator | None = None,
+    ) -> Float[Tensor, "rays"]:
+        """The alpha of :meth:`render_rays` alone, with the same gradient: nothing is shaded."""
+        hit, rays_hit, depths = _sampled(codes, rays, settings, generator)
+        weights, kept, _ = self._weighed(codes, rays_hit, depths, settings)
+        return weights.new_zeros(len(rays.origins)).index_add(0, hit[kept[:, 0]], weights)
+
     def _weighed(
         self,
-        state: HandState,
+        codes: HandCodes,
         rays: Rays,
         depths: Float[Tensor, "rays samples"],
         settings: RenderSettings,
     ) -> tuple[Float[Tensor, "kept"], Int[Tensor, "kept 2"], Float[Tensor, "kept bones"]]:
         """Weights of the samples that can be seen, which they are, and what lies before them."""
         num_rays, num_samples = depths.shape
-        occupancy, soft, items = self._march(state, rays, depths, settings)
+        occupancy, soft, items = self._march(codes, rays, depths, settings)
         is_kept = visibility(occupancy) > settings.smallest_weight
         kept = is_kept.nonzero()
         directed = directed_occupancy(soft)[is_kept]
@@ -366,13 +372,13 @@ class HandAvatar(nn.Module):
             used = PairItems(item_position[is_used], items.pairs[is_used], items.is_wanted[is_used])
             ray, sample = kept.unbind(-1)
             points = rays.origins[ray] + depths[ray, sample][:, None] * rays.directions[ray]
-            again = self.occupancy.of_items(state.codes, points, used)
+            again = self.occupancy.of_items(codes, points, used)
             occupancy = occupancy.index_put((ray, sample), again)
         return visibility(occupancy)[is_kept], kept, directed
 
     def _march(
         self,
-        state: HandState,
+        codes: HandCodes,
         rays: Rays,
         depths: Float[Tensor, "rays samples"],
         settings: RenderSettings,
@@ -385,13 +391,13 @@ class HandAvatar(nn.Module):
         """
         num_rays, num_samples = depths.shape
         occupancy = torch.zeros_like(depths)
-        soft = depths.new_zeros(num_rays, num_samples, state.codes.boxes.lower.shape[0])
+        soft = depths.new_zeros(num_rays, num_samples, codes.boxes.lower.shape[0])
         found: list[PairItems] = []
 
         def evaluate(flat: Int[Tensor, "samples"]) -> None:
             ray = flat // num_samples
             points = rays.origins[ray] + depths.view(-1)[flat][:, None] * rays.directions[ray]
-            result = self.occupancy(state.codes, points)
+            result = self.occupancy(codes, points)
             occupancy.view(-1)[flat] = result.whole
             soft.view(-1, soft.shape[-1])[flat] = result.soft_parts
             found.append(replace(result.items, points=flat[result.items.points]))
@@ -562,3 +568,16 @@ class HandAvatar(nn.Module):
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
             raise CheckpointError(f"{path}: not a complete avatar ({error})") from error
         return avatar
+
+
+def _sampled(
+    codes: HandCodes, rays: Rays, settings: RenderSettings, generator: torch.Generator | None
+) -> tuple[Int[Tensor, "hit"], Rays, Float[Tensor, "hit samples"]]:
+    """The rays that meet the hand's part boxes: their numbers, themselves, depths along them."""
+    boxes = codes.boxes
+    near, far, is_hit = intervals_through_boxes(
+        rays, boxes.bone_from_world, boxes.lower - boxes.margin, boxes.upper + boxes.margin
+    )
+    hit = is_hit.nonzero()[:, 0]
+    depths = depths_along(near[hit], far[hit], settings.num_samples, generator)
+    return hit, Rays(rays.origins[hit], rays.directions[hit]), depths

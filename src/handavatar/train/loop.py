@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar, RenderSettings, chosen_device
@@ -18,8 +18,9 @@ from handavatar.field.shading import OrientedCues, PaperCues
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.rigs import find_rig
-from handavatar.render.silhouette import signed_distance, soft_mask
+from handavatar.render.silhouette import soft_mask
 from handavatar.train.appearance import SeenSamples, appearance_loss, find_seen_samples
+from handavatar.train.border import border_pixels, fit_border
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.labelled_poses import sample_points
 from handavatar.train.losses import border_loss, color_loss, occupancy_loss
@@ -48,9 +49,6 @@ from handavatar.train.runs import (
 )
 from handavatar.train.stopping import Interrupted, stop_signals
 
-BORDER_REACH = 4.0
-"""Pixels."""
-
 
 @dataclass(frozen=True)
 class Method:
@@ -65,6 +63,7 @@ class Method:
         personal_steps: after the outlines, before the first step, the pair decoder learns the
             personal hand for so many steps (``train.personal_occupancy``).
         sharpness: of the occupancy, from then on; see :class:`PairOccupancy`.
+        border_steps: then the decoder learns the borders of the masks (``train.border``).
         warm_steps: the first steps fit albedo and illumination alone, on samples that are found
             once (``train.appearance``); later steps recall these.
         warm_pixels: pixels per such step and per recall, from all frames.
@@ -101,6 +100,7 @@ class Method:
     outline_visits: int = 3
     personal_steps: int = 0
     sharpness: float = 1.0
+    border_steps: int = 0
     warm_steps: int = 0
     warm_pixels: int = 2560
     warm_stride: int = 6
@@ -332,6 +332,10 @@ def _fit_or_restore_outlines(
             poses = [frame.pose for frame in _corrected(training, frames)]
             fit_occupancy(training.avatar, poses, method.personal_steps, options.seed)
         training.avatar.occupancy.sharpness = method.sharpness
+        if method.border_steps:
+            corrected = _corrected(training, frames)
+            settings = _settings(method)
+            fit_border(training.avatar, corrected, method.border_steps, settings, options.seed)
         tensors = {
             f"{prefix}{name}": value.clone()
             for prefix, module in modules.items()
@@ -435,6 +439,11 @@ def train_step(
     return sums
 
 
+def _settings(method: Method) -> RenderSettings:
+    """Of rays that are learned from: little is left out of their gradient."""
+    return RenderSettings(num_samples=method.num_samples, smallest_weight=1e-6, stop=1e-5)
+
+
 def frame_losses(
     training: Training,
     frame: Frame,
@@ -466,7 +475,7 @@ def frame_losses(
         predicted = avatar.occupancy.of_items(state.codes, points, items)
         losses["occupancy"] = occupancy_loss(predicted, labels)
 
-    settings = RenderSettings(num_samples=method.num_samples, smallest_weight=1e-6, stop=1e-5)
+    settings = _settings(method)
     patches = [
         patch_pixels(frame.mask, method.patch_size, method.patch_strides, generator)
         for _ in range(method.patches)
@@ -539,18 +548,6 @@ def patch_pixels(
     left = min(max(int(center[1]) - extent // 2, 0), width - extent)
     y, x = torch.meshgrid(top + steps, left + steps, indexing="ij")
     return torch.stack([x, y], dim=-1).flatten(0, 1)
-
-
-def border_pixels(
-    coverage: Float[Tensor, "height width"], count: int, generator: torch.Generator
-) -> Int[Tensor, "pixels 2"]:
-    """Pixels (x, y) at most ``BORDER_REACH`` from the border of the mask, drawn evenly.
-
-    As many as asked for, or as there are.
-    """
-    y, x = (signed_distance(coverage).abs() < BORDER_REACH).nonzero().unbind(-1)
-    chosen = torch.randperm(len(x), generator=generator)[:count]
-    return torch.stack([x[chosen], y[chosen]], dim=-1)
 
 
 def _frame_number(num_frames: int, visit: int, seed: int) -> int:

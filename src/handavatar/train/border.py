@@ -1,0 +1,108 @@
+"""Beside the border of a mask: where the field ends in the picture.
+
+Occupancy points say where the surface is; along a grazing ray their uncertainty adds up, and the
+picture's outline lies outside of it. Rays beside the border see the sum itself.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from handavatar.avatar import HandAvatar, RenderSettings
+from handavatar.capture.frames import Frame
+from handavatar.field.occupancy import HandCodes
+from handavatar.field.threads import mapped
+from handavatar.geometry.cameras import Rays, pixel_centers, rays_through_pixels
+from handavatar.render.silhouette import signed_distance
+from handavatar.train.losses import border_loss
+from handavatar.train.pretraining import learning_rate, prior_optimizers, set_rate
+from handavatar.train.progress import Progress
+
+BORDER_REACH = 4.0
+"""Pixels."""
+# Frames per step, and pixels of each.
+_FRAMES = 2
+_PIXELS = 256
+_RATE = 4e-4
+_LAST_RATE = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class _Border:
+    """An encoded hand and rays through the pixels beside the border of its mask."""
+
+    codes: HandCodes
+    rays: Rays
+    coverage: Float[Tensor, "rays"]
+
+
+def fit_border(
+    avatar: HandAvatar, frames: list[Frame], steps: int, settings: RenderSettings, seed: int
+) -> None:
+    """Trains the pair decoder until its outlines lie on the borders of the masks.
+
+    Args:
+        avatar: only its pair decoder changes.
+        frames: of training, with their poses as the outlines have them.
+        steps: of ``_FRAMES`` frames and ``_PIXELS`` rays of each.
+        settings: of the rays.
+        seed: of frames, rays and samples.
+
+    Departs: the authors leave the outline to the colours; see
+        :func:`~handavatar.train.losses.border_loss`.
+    """
+    optimizers = prior_optimizers(avatar.occupancy.decoder)
+    generator = torch.Generator().manual_seed(seed)
+    average = math.nan
+    with Progress("border", steps) as progress:
+        borders = _borders(avatar, frames if steps else [])
+        for step in range(1, steps + 1):
+            set_rate(optimizers, learning_rate(step, steps, _RATE, _LAST_RATE))
+            for optimizer in optimizers.values():
+                optimizer.zero_grad(set_to_none=True)
+            losses = []
+            for number in torch.randint(len(borders), (_FRAMES,), generator=generator).tolist():
+                border = borders[number]
+                some = torch.randint(len(border.coverage), (_PIXELS,), generator=generator)
+                some = some.to(avatar.device)
+                rays = Rays(border.rays.origins[some], border.rays.directions[some])
+                alpha = avatar.alpha(border.codes, rays, settings, generator)
+                losses.append(border_loss(alpha, border.coverage[some]))
+            loss = torch.stack(losses).mean()
+            loss.backward()
+            for optimizer in optimizers.values():
+                optimizer.step()
+            value = float(loss.detach())
+            average = value if math.isnan(average) else 0.95 * average + 0.05 * value
+            progress.update(step, loss=average)
+    avatar.occupancy.zero_grad(set_to_none=True)
+
+
+def _borders(avatar: HandAvatar, frames: list[Frame]) -> list[_Border]:
+    def border(frame: Frame) -> _Border:
+        pose, camera = frame.pose.to(avatar.device), frame.camera.to(avatar.device)
+        codes = avatar.occupancy.encode(avatar.parts, avatar.personal(pose).posed(pose))
+        x, y = _beside(frame.alpha).unbind(-1)
+        rays = rays_through_pixels(camera, pixel_centers(camera)[y, x])
+        return _Border(codes, rays, frame.alpha[y, x].to(avatar.device))
+
+    return [border for border in mapped(border, frames) if len(border.coverage)]
+
+
+def _beside(coverage: Float[Tensor, "height width"]) -> Int[Tensor, "pixels 2"]:
+    y, x = (signed_distance(coverage).abs() < BORDER_REACH).nonzero().unbind(-1)
+    return torch.stack([x, y], dim=-1)
+
+
+def border_pixels(
+    coverage: Float[Tensor, "height width"], count: int, generator: torch.Generator
+) -> Int[Tensor, "pixels 2"]:
+    """Pixels (x, y) at most ``BORDER_REACH`` from the border of the mask, drawn evenly.
+
+    As many as asked for, or as there are.
+    """
+    pixels = _beside(coverage)
+    return pixels[torch.randperm(len(pixels), generator=generator)[:count]]
