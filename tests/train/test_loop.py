@@ -20,12 +20,12 @@ from handavatar.capture.frames import CaptureError, read_capture
 from handavatar.evaluate.perceptual import perceptual_loss
 from handavatar.hand.rig import RigError
 from handavatar.train import loop
+from handavatar.train.border import border_pixels
 from handavatar.train.loop import (
     METHODS,
     Interrupted,
     TrainOptions,
     begin_training,
-    border_pixels,
     patch_pixels,
     train,
     train_step,
@@ -75,7 +75,7 @@ def _assert_same_end(run: Path, whole_run: Path) -> None:
     assert ours.read_bytes() == theirs.read_bytes()
     assert read_log(open_run(run)) == read_log(open_run(whole_run))
     ends = [latest_checkpoint(open_run(folder)) for folder in (run, whole_run)]
-    for name in ("model.safetensors", "optimizer.safetensors"):
+    for name in ("model.safetensors", "adam.safetensors", "muon.safetensors"):
         first, second = ((end.folder / name).read_bytes() for end in ends if end is not None)
         assert first == second, name
 

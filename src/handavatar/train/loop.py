@@ -31,6 +31,7 @@ from handavatar.train.optimizer_state import (
 )
 from handavatar.train.outlines import EdgeSet, corrected_pose, fit_outlines, shape_losses
 from handavatar.train.personal_occupancy import fit_occupancy
+from handavatar.train.pretraining import is_wide, muon
 from handavatar.train.prior import SHIPPED_PRIOR, load_prior
 from handavatar.train.progress import Progress
 from handavatar.train.runs import (
@@ -78,6 +79,8 @@ class Method:
         num_samples: samples per ray while training.
         silhouette_size: the mask is compared at this many pixels along a side.
         lr: learning rate of albedo and illumination at the start.
+        lr_matrices: of the matrices of albedo and illumination, with Muon in place of Adam; None
+            leaves them to Adam.
         lr_shape: learning rate of the shape offsets at the start.
         lr_codes: learning rate of the albedo codes at the start.
         lr_decoder: learning rate of the pair decoder at the start.
@@ -108,6 +111,7 @@ class Method:
     border_pixels: int = 256
     perceptual_weight: float = 1.0
     lr: float = 5e-4
+    lr_matrices: float | None = None
     lr_shape: float = 5e-4
     lr_codes: float = 5e-4
     lr_decoder: float = 5e-5
@@ -121,11 +125,12 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "quick": Method(
-        steps=1220,
+        steps=320,
         cues=OrientedCues(),
         personal_steps=600,
-        sharpness=2.0,
-        warm_steps=1200,
+        sharpness=3.0,
+        border_steps=150,
+        warm_steps=310,
         warm_stride=4,
         frames=1,
         patches=1,
@@ -135,9 +140,12 @@ METHODS: dict[str, Method] = {
         patch_strides=(1, 2, 4),
         perceptual_weight=0.1,
         lr=2e-3,
-        lr_shape=2e-3,
+        lr_matrices=1.2e-2,
+        lr_shape=1e-2,
         lr_codes=1e-2,
-        lr_decoder=4e-4,
+        lr_decoder=2e-3,
+        lr_pose=5e-3,
+        decay=0.02,
         occupancy_every=4,
     ),
     "paper": Method(
@@ -189,12 +197,12 @@ class Training:
     Attributes:
         avatar: what is trained.
         corrections: of the tracked poses; None where poses are known exactly.
-        optimizer: over both.
+        optimizers: over both, by name.
     """
 
     avatar: HandAvatar
     corrections: PoseCorrections | None
-    optimizer: torch.optim.Optimizer
+    optimizers: dict[str, torch.optim.Optimizer]
 
 
 def train(options: TrainOptions) -> Path:
@@ -234,7 +242,7 @@ def train(options: TrainOptions) -> Path:
         edges = EdgeSet.of(training.avatar.rig)
         with Progress("train", steps, start) as progress:
             for step in range(start + 1, steps + 1):
-                _set_learning_rates(training.optimizer, method.decay ** ((step - 1) / steps))
+                _set_learning_rates(training, method.decay ** ((step - 1) / steps))
                 if seen is not None and step <= method.warm_steps:
                     figures = warm_step(training, seen, method, step, options.seed)
                 else:
@@ -288,11 +296,11 @@ def begin_training(
     corrections = PoseCorrections(len(frames)) if capture.is_tracked else None
     device = chosen_device(options.device)
     avatar.moved_to(device)
+    networks = [*avatar.albedo.mlp.parameters(), *avatar.illumination.parameters()]
+    wide = [p for p in networks if method.lr_matrices is not None and is_wide(p)]
+    others = [p for p in networks if all(p is not chosen for chosen in wide)]
     groups: list[dict[str, Any]] = [
-        {
-            "params": [*avatar.albedo.mlp.parameters(), *avatar.illumination.parameters()],
-            "lr": method.lr,
-        },
+        {"params": others, "lr": method.lr},
         {"params": list(avatar.shape.parameters()), "lr": method.lr_shape},
         {"params": [avatar.albedo.codes], "lr": method.lr_codes},
         {"params": list(avatar.occupancy.decoder.parameters()), "lr": method.lr_decoder},
@@ -303,9 +311,13 @@ def begin_training(
             {"params": list(corrections.rotations), "lr": method.lr_pose},
             {"params": list(corrections.translations), "lr": 0.1 * method.lr_pose},
         ]
-    for group in groups:
-        group["initial_lr"] = group["lr"]
-    return Training(avatar, corrections, torch.optim.Adam(groups))
+    optimizers: dict[str, torch.optim.Optimizer] = {"adam": torch.optim.Adam(groups)}
+    if method.lr_matrices is not None:
+        optimizers["muon"] = muon(wide, method.lr_matrices)
+    for optimizer in optimizers.values():
+        for group in optimizer.param_groups:
+            group["initial_lr"] = group["lr"]
+    return Training(avatar, corrections, optimizers)
 
 
 def _fit_or_restore_outlines(
@@ -388,10 +400,11 @@ def warm_step(
 ) -> dict[str, float]:
     """One optimiser step of the appearance alone, on ``seen``."""
     generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
-    training.optimizer.zero_grad(set_to_none=True)
+    _clear_gradients(training)
     color, squared = appearance_loss(training.avatar, seen, _some_pixels(seen, method, generator))
     color.backward()
-    training.optimizer.step()
+    for optimizer in training.optimizers.values():
+        optimizer.step()
     psnr = -10 * math.log10(max(float(squared), 1e-10))
     return {"color": float(color.detach()), "loss": float(color.detach()), "psnr": psnr}
 
@@ -418,7 +431,7 @@ def train_step(
         The losses' values and the PSNR over the patches.
     """
     generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
-    training.optimizer.zero_grad(set_to_none=True)
+    _clear_gradients(training)
     sums: dict[str, float] = {}
     for place in range(method.frames):
         number = _frame_number(len(frames), (step - 1) * method.frames + place, seed)
@@ -434,7 +447,8 @@ def train_step(
         recall, _ = appearance_loss(training.avatar, seen, _some_pixels(seen, method, generator))
         recall.backward()
         sums["recall"] = float(recall.detach())
-    training.optimizer.step()
+    for optimizer in training.optimizers.values():
+        optimizer.step()
     sums["psnr"] = -10 * math.log10(max(sums.pop("squared"), 1e-10))
     return sums
 
@@ -557,9 +571,15 @@ def _frame_number(num_frames: int, visit: int, seed: int) -> int:
     return int(torch.randperm(num_frames, generator=generator)[place])
 
 
-def _set_learning_rates(optimizer: torch.optim.Optimizer, factor: float) -> None:
-    for group in optimizer.param_groups:
-        group["lr"] = group["initial_lr"] * factor
+def _set_learning_rates(training: Training, factor: float) -> None:
+    for optimizer in training.optimizers.values():
+        for group in optimizer.param_groups:
+            group["lr"] = group["initial_lr"] * factor
+
+
+def _clear_gradients(training: Training) -> None:
+    for optimizer in training.optimizers.values():
+        optimizer.zero_grad(set_to_none=True)
 
 
 def _open_or_create(options: TrainOptions, capture: Capture, perceptual: str, steps: int) -> Run:
@@ -613,12 +633,10 @@ def _save(run: Run, training: Training, outlines: dict[str, Tensor], step: int) 
     if training.corrections is not None:
         state = training.corrections.state_dict()
         model |= {f"corrections.{name}": value for name, value in state.items()}
-    tensors = {
-        "model": model,
-        "optimizer": optimizer_tensors(training.optimizer),
-        "outlines": outlines,
-    }
-    save_checkpoint(run, step, tensors, optimizer_options(training.optimizer))
+    tensors = {"model": model, "outlines": outlines}
+    tensors |= {name: optimizer_tensors(part) for name, part in training.optimizers.items()}
+    state = {name: optimizer_options(part) for name, part in training.optimizers.items()}
+    save_checkpoint(run, step, tensors, state)
 
 
 def _restore(run: Run, checkpoint: Checkpoint | None, training: Training) -> int:
@@ -631,7 +649,8 @@ def _restore(run: Run, checkpoint: Checkpoint | None, training: Training) -> int
     training.avatar.load_state_dict(_named(model, "avatar."))
     if training.corrections is not None:
         training.corrections.load_state_dict(_named(model, "corrections."))
-    restore_optimizer(training.optimizer, contents.tensors["optimizer"], contents.state)
+    for name, optimizer in training.optimizers.items():
+        restore_optimizer(optimizer, contents.tensors[name], contents.state[name])
     truncate_log(run, checkpoint.step)
     return checkpoint.step
 

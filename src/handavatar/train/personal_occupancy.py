@@ -26,7 +26,7 @@ from handavatar.train.stage_times import StageTimes
 _HANDS = 2
 _POINTS = 1024
 _POOL = 8192
-_RATE = 1e-3
+_RATE = 3e-3
 _LAST_RATE = 1e-5
 # Radians, at most: poses between and beside those of the training frames.
 _POSE_NOISE = 0.08
