@@ -85,6 +85,34 @@ def test_pieces_of_rays_do_not_matter(small_avatar: HandAvatar, rendering: Rende
         torch.testing.assert_close(getattr(pieced, name), value, atol=1e-4, rtol=0)
 
 
+def test_at_the_outline_a_pixel_is_the_mean_of_four_rays(
+    small_avatar: HandAvatar, rendering: Rendering
+) -> None:
+    pose, camera = bent_pose(2), camera_above(24)
+    single = replace(FEW, edge_rays=1)
+    once = small_avatar.render(pose, camera, settings=single)
+    twice = small_avatar.render(pose, camera.resized(48, 48), settings=single)
+    is_edge = (rendering.alpha - once.alpha).abs() > 1e-6
+    assert 0.1 < float(is_edge.float().mean()) < 0.5
+    inner = is_edge.new_zeros(24, 24)
+    inner[1:-1, 1:-1] = True
+    around = [
+        -torch.nn.functional.max_pool2d(-sign * once.alpha[None], 3, 1, 1)[0] * sign
+        for sign in (1, -1)
+    ]
+    is_plain = (torch.stack(around).amax(0) < 0.1) | (torch.stack(around).amin(0) > 0.9)
+    for name, value in vars(rendering).items():
+        ray, mean = getattr(once, name), getattr(twice, name)
+        mean = mean.unflatten(0, (24, 2)).unflatten(2, (24, 2)).mean((1, 3))
+        torch.testing.assert_close(value[is_edge & inner], mean[is_edge & inner], atol=1e-4, rtol=0)
+        assert torch.equal(value[is_plain], ray[is_plain]), name
+    # Coverage as more rays have it: 16 of every pixel.
+    many = small_avatar.render(pose, camera.resized(96, 96), settings=single).alpha
+    many = many.unflatten(0, (24, 4)).unflatten(2, (24, 4)).mean((1, 3))
+    errors = [float((image - many).square().mean()) for image in (once.alpha, rendering.alpha)]
+    assert errors[1] < 0.5 * errors[0]
+
+
 def test_saving_and_loading_changes_nothing(
     small_avatar: HandAvatar, rendering: Rendering, tmp_path: Path
 ) -> None:
@@ -254,7 +282,7 @@ def test_the_default_settings_lose_less_than_can_be_seen(small_avatar: HandAvata
     with torch.no_grad():
         state = small_avatar.prepare(pose)
         expected = _rendered_plainly(small_avatar, state, _rays(camera), 64)
-        found = small_avatar.render(pose, camera)
+        found = small_avatar.render(pose, camera, settings=RenderSettings(edge_rays=1))
     for name in ("color", "albedo", "alpha"):
         error = getattr(found, name).flatten(0, 1) - getattr(expected, name).view(144, -1).squeeze(
             -1

@@ -88,6 +88,8 @@ class RenderSettings:
         mask_margin: only pixels within this share of the picture's width of the posed mesh are
             looked at; 6 pixels of 256. The occupancy of a trained field ends some millimetres
             off the mesh; infinity looks at all pixels.
+        edge_rays: at the hand's outline a pixel is the mean of so many rays in both directions; a
+            single one says all or nothing of a pixel that the hand covers in part.
         rays_at_once: bounds the memory.
     """
 
@@ -98,6 +100,7 @@ class RenderSettings:
     refine_above: float = 3e-7
     group: int = 4
     mask_margin: float = 6 / 256
+    edge_rays: int = 2
     rays_at_once: int = 4096
 
 
@@ -446,21 +449,44 @@ class HandAvatar(nn.Module):
         settings = settings or RenderSettings()
         state = self.prepare(pose.to(self.device))
         camera = camera.to(self.device)
-        pixels = self.near_mesh(state, camera, settings.mask_margin).flatten().nonzero()[:, 0]
-        rays = rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1)[pixels])
+        near = self.near_mesh(state, camera, settings.mask_margin).flatten().nonzero()[:, 0]
+        centers = pixel_centers(camera).flatten(0, 1)
+        size = (camera.height, camera.width)
+        flat = {
+            name: values.new_zeros(camera.height * camera.width, *values.shape[1:]).index_copy(
+                0, near, values
+            )
+            for name, values in self._along(state, camera, centers[near], settings, edit).items()
+        }
+        if settings.edge_rays > 1:
+            is_edge = _is_edge(flat["alpha"].unflatten(0, size)).flatten()
+            edge = near[is_edge[near]]
+            places = (torch.arange(settings.edge_rays).to(centers) + 0.5) / settings.edge_rays
+            offsets = torch.cartesian_prod(places, places) - 0.5
+            inside = (centers[edge][:, None] + offsets).flatten(0, 1)
+            for name, values in self._along(state, camera, inside, settings, edit).items():
+                mean = values.unflatten(0, (len(edge), len(offsets))).mean(1)
+                flat[name] = flat[name].index_copy(0, edge, mean)
+        channels = {name: values.unflatten(0, size) for name, values in flat.items()}
+        return Rendering(**channels)
+
+    def _along(
+        self,
+        state: HandState,
+        camera: Camera,
+        positions: Float[Tensor, "rays 2"],
+        settings: RenderSettings,
+        edit: Edit | None,
+    ) -> dict[str, Tensor]:
+        """The channels of :class:`RayValues` at places of the picture, pixels."""
+        rays = rays_through_pixels(camera, positions)
         pieces = []
-        for start in range(0, max(len(pixels), 1), settings.rays_at_once):
+        for start in range(0, max(len(positions), 1), settings.rays_at_once):
             window = slice(start, start + settings.rays_at_once)
             part = Rays(rays.origins[window], rays.directions[window])
             pieces.append(self.render_rays(state, part, settings, edit=edit))
-        channels = {}
-        for name in RayValues.__dataclass_fields__:
-            values = torch.cat([getattr(piece, name) for piece in pieces])
-            flat = values.new_zeros(camera.height * camera.width, *values.shape[1:])
-            channels[name] = flat.index_copy(0, pixels, values).unflatten(
-                0, (camera.height, camera.width)
-            )
-        return Rendering(**channels)
+        names = RayValues.__dataclass_fields__
+        return {name: torch.cat([getattr(piece, name) for piece in pieces]) for name in names}
 
     @torch.no_grad()
     def near_mesh(
@@ -581,3 +607,15 @@ def _sampled(
     hit = is_hit.nonzero()[:, 0]
     depths = depths_along(near[hit], far[hit], settings.num_samples, generator)
     return hit, Rays(rays.origins[hit], rays.directions[hit]), depths
+
+
+def _is_edge(alpha: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Pixels that the outline crosses: half covered, or unlike one of the four beside them."""
+    is_edge = (alpha > 0.1) & (alpha < 0.9)
+    down = (alpha[1:] - alpha[:-1]).abs() > 0.25
+    across = (alpha[:, 1:] - alpha[:, :-1]).abs() > 0.25
+    is_edge[1:] |= down
+    is_edge[:-1] |= down
+    is_edge[:, 1:] |= across
+    is_edge[:, :-1] |= across
+    return is_edge
