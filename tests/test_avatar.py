@@ -207,6 +207,26 @@ def test_training_jitter_repeats_with_its_generator(small_avatar: HandAvatar) ->
     assert torch.equal(colors[0], colors[1]) and not torch.equal(colors[0], colors[2])
 
 
+def test_alpha_alone_has_value_and_gradient_of_the_whole_evaluation(
+    small_avatar: HandAvatar,
+) -> None:
+    rays, state = _rays(camera_above(12)), small_avatar.prepare(bent_pose(1))
+    weights = list(small_avatar.occupancy.decoder.parameters())
+    direction = torch.randn(len(rays.origins), generator=torch.Generator().manual_seed(4))
+    gradients = []
+    whole = small_avatar.render_rays(state, rays, FEW).alpha
+    alone = small_avatar.alpha(state.codes, rays, FEW)
+    assert torch.equal(whole, alone)
+    for alpha in (whole, alone):
+        total = (direction * alpha).sum()
+        gradients.append(torch.autograd.grad(total, weights, retain_graph=True, allow_unused=True))
+    assert any(gradient is not None and bool(gradient.any()) for gradient in gradients[0])
+    for first, second in zip(*gradients, strict=True):
+        assert (first is None) == (second is None)
+        if first is not None and second is not None:
+            torch.testing.assert_close(first, second, rtol=1e-4, atol=1e-6)
+
+
 def test_an_untrained_avatar_starts_with_the_given_colour(small_avatar: HandAvatar) -> None:
     torch.manual_seed(1)
     avatar = HandAvatar(small_avatar.base_rig, torch.zeros(10), rounds=0, num_anchors=64)

@@ -20,7 +20,6 @@ from handavatar.capture.frames import CaptureError, read_capture
 from handavatar.evaluate.perceptual import perceptual_loss
 from handavatar.hand.rig import RigError
 from handavatar.train import loop
-from handavatar.train.border import border_pixels
 from handavatar.train.loop import (
     METHODS,
     Interrupted,
@@ -372,19 +371,6 @@ def test_patches_are_square_grids_inside_the_picture_and_mostly_on_the_hand() ->
         on_hand += bool(mask[y, x].any())
     assert strides == {1, 2, 5}  # 9 does not fit.
     assert on_hand > 90
-
-
-def test_border_pixels_lie_beside_the_border_and_nowhere_else() -> None:
-    mask = torch.zeros(40, 40)
-    mask[10:30, 10:30] = 1
-    generator = torch.Generator().manual_seed(0)
-    x, y = border_pixels(mask, 5000, generator).unbind(-1)
-    outside = torch.maximum((x - 19.5).abs(), (y - 19.5).abs()) - 10
-    assert float(outside.min()) > -4 and float(outside.max()) < 4
-    # Four pixels on either side of twenty: about 8 times 80, corners aside, each once.
-    assert 560 < len(x) < 720 and len(torch.unique(x * 40 + y)) == len(x)
-    assert len(border_pixels(mask, 100, generator)) == 100
-    assert len(border_pixels(torch.zeros(9, 9), 10, generator)) == 0
 
 
 def test_an_empty_mask_gives_the_middle() -> None:

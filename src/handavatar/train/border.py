@@ -47,7 +47,7 @@ def fit_border(
     Args:
         avatar: only its pair decoder changes.
         frames: of training, with their poses as the outlines have them.
-        steps: of ``_FRAMES`` frames and ``_PIXELS`` rays of each.
+        steps: of ``_FRAMES`` frames and ``_PIXELS`` rays of each; none if no mask has a border.
         settings: of the rays.
         seed: of frames, rays and samples.
 
@@ -59,7 +59,7 @@ def fit_border(
     average = math.nan
     with Progress("border", steps) as progress:
         borders = _borders(avatar, frames if steps else [])
-        for step in range(1, steps + 1):
+        for step in range(1, steps + 1 if borders else 1):
             set_rate(optimizers, learning_rate(step, steps, _RATE, _LAST_RATE))
             for optimizer in optimizers.values():
                 optimizer.zero_grad(set_to_none=True)
