@@ -445,6 +445,8 @@ class HandAvatar(nn.Module):
             camera: decides the size of the picture.
             edit: changes of the look.
             settings: samples and bounds.
+
+        Departs: the authors send one ray through every pixel, and the outline is jagged.
         """
         settings = settings or RenderSettings()
         state = self.prepare(pose.to(self.device))

@@ -268,7 +268,11 @@ def train(options: TrainOptions) -> Path:
 def begin_training(
     capture: Capture, frames: list[Frame], method: Method, options: TrainOptions
 ) -> Training:
-    """An untrained avatar of the capture's person with the prior's geometry, and its optimiser."""
+    """An untrained avatar of the capture's person with the prior's geometry, and its optimisers.
+
+    Departs: the authors use Adam alone; where the method says so, Muon takes the matrices of albedo
+        and illumination, and a quarter of the steps does.
+    """
     rig = find_rig(capture.rig_sha256, capture.rig_name)
     torch.manual_seed(options.seed)
     info = {
