@@ -12,12 +12,12 @@ from source_tree import find_definition, modules
 EXACTLY = {
     "geometry.cameras": "Camera Rays look_at pixel_centers project rays_through_pixels",
     "geometry.rotations": (
-        "apply_rigid axis_angle_from_matrix invert_rigid matrix_from_axis_angle "
+        "apply_rigid axis_angle_from_matrix invert_rigid left_jacobian matrix_from_axis_angle "
         "quaternion_from_matrix rigid_transform skew"
     ),
     "hand.pose": (
         "BONE_NAMES BONE_PARENTS CONNECTED_PAIRS FINGER_BONES HandPose NUM_BONES "
-        "bone_transforms linear_blend_skinning"
+        "bone_transforms linear_blend_skinning skinning_jacobian"
     ),
     "hand.rig": "RIG_ARRAYS LicensedRigMissing PosedHand Rig RigError ShapedHand",
     "hand.open_hand": "Level load_open_hand",
