@@ -4,7 +4,6 @@ Occupancy points say where the surface is; along a grazing ray their uncertainty
 picture's outline lies outside of it. Rays beside the border see the sum itself.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -18,8 +17,7 @@ from handavatar.field.threads import mapped
 from handavatar.geometry.cameras import Rays, pixel_centers, rays_through_pixels
 from handavatar.render.silhouette import signed_distance
 from handavatar.train.losses import border_loss
-from handavatar.train.pretraining import learning_rate, prior_optimizers, set_rate
-from handavatar.train.progress import Progress
+from handavatar.train.pretraining import descend
 
 BORDER_REACH = 4.0
 """Pixels."""
@@ -54,31 +52,22 @@ def fit_border(
     Departs: the authors leave the outline to the colours; see
         :func:`~handavatar.train.losses.border_loss`.
     """
-    optimizers = prior_optimizers(avatar.occupancy.decoder)
     generator = torch.Generator().manual_seed(seed)
-    average = math.nan
-    with Progress("border", steps) as progress:
-        borders = _borders(avatar, frames if steps else [])
-        for step in range(1, steps + 1 if borders else 1):
-            set_rate(optimizers, learning_rate(step, steps, _RATE, _LAST_RATE))
-            for optimizer in optimizers.values():
-                optimizer.zero_grad(set_to_none=True)
-            losses = []
-            for number in torch.randint(len(borders), (_FRAMES,), generator=generator).tolist():
-                border = borders[number]
-                some = torch.randint(len(border.coverage), (_PIXELS,), generator=generator)
-                some = some.to(avatar.device)
-                rays = Rays(border.rays.origins[some], border.rays.directions[some])
-                alpha = avatar.alpha(border.codes, rays, settings, generator)
-                losses.append(border_loss(alpha, border.coverage[some]))
-            loss = torch.stack(losses).mean()
-            loss.backward()
-            for optimizer in optimizers.values():
-                optimizer.step()
-            value = float(loss.detach())
-            average = value if math.isnan(average) else 0.95 * average + 0.05 * value
-            progress.update(step, loss=average)
-    avatar.occupancy.zero_grad(set_to_none=True)
+    borders = _borders(avatar, frames if steps else [])
+
+    def loss_of_step() -> Float[Tensor, ""]:
+        losses = []
+        for number in torch.randint(len(borders), (_FRAMES,), generator=generator).tolist():
+            border = borders[number]
+            some = torch.randint(len(border.coverage), (_PIXELS,), generator=generator)
+            some = some.to(avatar.device)
+            rays = Rays(border.rays.origins[some], border.rays.directions[some])
+            alpha = avatar.alpha(border.codes, rays, settings, generator)
+            losses.append(border_loss(alpha, border.coverage[some]))
+        return torch.stack(losses).mean()
+
+    decoder, steps = avatar.occupancy.decoder, steps if borders else 0
+    descend("border", decoder, steps, (_RATE, _LAST_RATE), loss_of_step)
 
 
 def _borders(avatar: HandAvatar, frames: list[Frame]) -> list[_Border]:

@@ -5,7 +5,6 @@ millimetre, which is half a pixel of the outline. Points around the personal mes
 known, tell it more for the same time than rays do.
 """
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -18,8 +17,7 @@ from handavatar.field.threads import mapped
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.pose import HandPose
 from handavatar.train.labelled_poses import training_points
-from handavatar.train.pretraining import OccupancyLoss, learning_rate, prior_optimizers, set_rate
-from handavatar.train.progress import Progress
+from handavatar.train.pretraining import OccupancyLoss, descend
 from handavatar.train.stage_times import StageTimes
 
 # Hands per step, points of each that a step draws, and points of each there are.
@@ -54,31 +52,20 @@ def fit_occupancy(avatar: HandAvatar, poses: list[HandPose], steps: int, seed: i
     Departs: the authors leave the personal surface to the joint training, which in minutes sees
         too few points of it.
     """
-    field = avatar.occupancy
-    loss_of = OccupancyLoss(field, avatar.parts, StageTimes())
-    optimizers = prior_optimizers(field.decoder)
+    loss_of = OccupancyLoss(avatar.occupancy, avatar.parts, StageTimes())
     generator = torch.Generator().manual_seed(seed)
-    average = math.nan
-    with Progress("occupancy", steps) as progress:
-        # Hands and labels cost as much as a step: once for all steps, one of every pose.
-        hands = _known_hands(avatar, poses if steps else [], seed)
-        for step in range(1, steps + 1):
-            set_rate(optimizers, learning_rate(step, steps, _RATE, _LAST_RATE))
-            for optimizer in optimizers.values():
-                optimizer.zero_grad(set_to_none=True)
-            losses = []
-            for number in torch.randint(len(hands), (_HANDS,), generator=generator).tolist():
-                hand = hands[number]
-                some = torch.randint(_POOL, (_POINTS,), generator=generator).to(avatar.device)
-                losses.append(loss_of.of_codes(hand.codes, hand.points[some], hand.is_inside[some]))
-            loss = torch.stack(losses).mean()
-            loss.backward()
-            for optimizer in optimizers.values():
-                optimizer.step()
-            value = float(loss.detach())
-            average = value if math.isnan(average) else 0.95 * average + 0.05 * value
-            progress.update(step, loss=average)
-    field.zero_grad(set_to_none=True)
+    # Hands and labels cost as much as a step: once for all steps, one of every pose.
+    hands = _known_hands(avatar, poses if steps else [], seed)
+
+    def loss_of_step() -> Float[Tensor, ""]:
+        losses = []
+        for number in torch.randint(len(hands), (_HANDS,), generator=generator).tolist():
+            hand = hands[number]
+            some = torch.randint(_POOL, (_POINTS,), generator=generator).to(avatar.device)
+            losses.append(loss_of.of_codes(hand.codes, hand.points[some], hand.is_inside[some]))
+        return torch.stack(losses).mean()
+
+    descend("occupancy", avatar.occupancy.decoder, steps, (_RATE, _LAST_RATE), loss_of_step)
 
 
 def _known_hands(avatar: HandAvatar, poses: list[HandPose], seed: int) -> list[_KnownHand]:

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -20,6 +20,7 @@ from handavatar.train.optimizer_state import (
     optimizer_tensors,
     restore_optimizer,
 )
+from handavatar.train.progress import Progress
 from handavatar.train.runs import (
     Json,
     Run,
@@ -133,6 +134,39 @@ def learning_rate(step: int, steps: int, highest: float, lowest: float) -> float
     rise = min(1.0, step / max(_WARM_UP * steps, 1))
     fall = 0.5 * (1 + math.cos(math.pi * step / max(steps, 1)))
     return rise * (lowest + (highest - lowest) * fall)
+
+
+def descend(
+    title: str,
+    decoder: nn.Module,
+    steps: int,
+    rates: tuple[float, float],
+    loss_of_step: Callable[[], Float[Tensor, ""]],
+) -> None:
+    """Trains a decoder alone, in one go, with the prior's optimisers.
+
+    Args:
+        title: of the progress.
+        decoder: whose gradients ``loss_of_step`` gives.
+        steps: how many.
+        rates: highest and last learning rate; see :func:`learning_rate`.
+        loss_of_step: the loss of the next step, on samples of its own.
+    """
+    optimizers = prior_optimizers(decoder)
+    average = math.nan
+    with Progress(title, steps) as progress:
+        for step in range(1, steps + 1):
+            set_rate(optimizers, learning_rate(step, steps, *rates))
+            for optimizer in optimizers.values():
+                optimizer.zero_grad(set_to_none=True)
+            loss = loss_of_step()
+            loss.backward()
+            for optimizer in optimizers.values():
+                optimizer.step()
+            value = float(loss.detach())
+            average = value if math.isnan(average) else 0.95 * average + 0.05 * value
+            progress.update(step, loss=average)
+    decoder.zero_grad(set_to_none=True)
 
 
 # --- the run folder -------------------------------------------------------------------------------
