@@ -163,6 +163,17 @@ def test_the_run_folder_holds_everything(whole_run: Path, tiny_capture: Path) ->
     assert {"camera_from_world", "rotations", "translation"} == info["view"].keys()
 
 
+def test_several_threads_give_the_same_bytes_every_time(tiny_capture: Path, tmp_path: Path) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        first, second = (train(_options(tiny_capture, tmp_path / name)) for name in ("a", "b"))
+    finally:
+        torch.set_num_threads(before)
+    _assert_same_end(first, second)
+    assert not torch.are_deterministic_algorithms_enabled()
+
+
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(
     tiny_capture: Path, tmp_path: Path
 ) -> None:

@@ -1,6 +1,8 @@
 """The training loop: capture in, avatar out. There is only this one."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -233,7 +235,7 @@ def train(options: TrainOptions) -> Path:
     training = begin_training(capture, frames, method, options)
     training.avatar.info["view"] = view_of(frames)
     run = _open_or_create(options, capture, perceptual.name, steps)
-    with locked(run), stop_signals() as stopped:
+    with locked(run), stop_signals() as stopped, _repeatable(device):
         checkpoint = latest_checkpoint(run)
         outlines = _fit_or_restore_outlines(run, checkpoint, training, frames, method, options)
         # Before the checkpoint is loaded: the samples are those of the geometry as it is now.
@@ -263,6 +265,20 @@ def train(options: TrainOptions) -> Path:
                     raise Interrupted(f"stopped at step {step}; continue with --resume auto")
     training.avatar.save(run.avatar)
     return run.folder
+
+
+@contextmanager
+def _repeatable(device: torch.device) -> Iterator[None]:
+    """The same bits every time on a CPU, with several threads too.
+
+    Torch's threads add the gradients of indexed values in any order, unless told otherwise.
+    """
+    before = torch.are_deterministic_algorithms_enabled()
+    torch.use_deterministic_algorithms(before or device.type == "cpu")
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before)
 
 
 def begin_training(
