@@ -1,6 +1,7 @@
 """What several tests need: a small avatar, and a capture of a few small pictures."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -116,6 +117,42 @@ def write_tiny_capture(
 def tiny_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three training and two test frames with known poses; read only."""
     return write_tiny_capture(tmp_path_factory.mktemp("capture") / "tiny")
+
+
+def avatar_of_the_prior() -> HandAvatar:
+    """The 778-vertex hand with the shipped prior, which was trained on a finer mesh."""
+    torch.manual_seed(0)
+    avatar = HandAvatar(load_open_hand("778"), torch.zeros(10), rounds=0, num_anchors=64)
+    load_prior(avatar.occupancy)
+    return avatar
+
+
+def assert_teaches_the_decoder_alone(avatar: HandAvatar, fit: Callable[[], None]) -> None:
+    """``fit`` changes every weight of the avatar's pair decoder, and leaves no gradient."""
+    before = {name: value.clone() for name, value in avatar.state_dict().items()}
+    fit()
+    changed = {n for n, v in avatar.state_dict().items() if not torch.equal(v, before[n])}
+    assert changed == {name for name in before if name.startswith("occupancy.decoder.")}
+    assert all(parameter.grad is None for parameter in avatar.parameters())
+
+
+def assert_teaching_repeats(fit: Callable[[HandAvatar, int, int], None]) -> None:
+    """The same seed gives the same bits, and no steps change nothing.
+
+    Args:
+        fit: teaches an avatar's pair decoder for so many steps with a seed.
+    """
+    results = []
+    for steps, seed in ((2, 3), (2, 3), (2, 4), (0, 3)):
+        avatar = avatar_of_the_prior()
+        fit(avatar, steps, seed)
+        results.append(avatar.occupancy.decoder.state_dict())
+    same, different, none = (
+        all(torch.equal(results[0][name], other[name]) for name in other) for other in results[1:]
+    )
+    assert same and not different and not none
+    untrained = avatar_of_the_prior().occupancy.decoder.state_dict()
+    assert all(torch.equal(untrained[name], results[3][name]) for name in untrained)
 
 
 @pytest.fixture(scope="session")

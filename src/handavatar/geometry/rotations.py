@@ -56,6 +56,7 @@ def left_jacobian(axis_angle: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batc
         Matrices from changes of axis-angle to rotations, both in radians, to first order.
     """
     squared = (axis_angle * axis_angle).sum(-1)
+    # Angle less sine cancels earlier than what Rodrigues' formula needs.
     is_small = squared < 1e-4
     safe = torch.where(is_small, torch.ones_like(squared), squared)
     angle = safe.sqrt()

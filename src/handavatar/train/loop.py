@@ -33,7 +33,7 @@ from handavatar.train.optimizer_state import (
 )
 from handavatar.train.outlines import EdgeSet, corrected_pose, fit_outlines, shape_losses
 from handavatar.train.personal_occupancy import fit_occupancy
-from handavatar.train.pretraining import is_wide, muon
+from handavatar.train.pretraining import muon, wide_and_narrow
 from handavatar.train.prior import SHIPPED_PRIOR, load_prior
 from handavatar.train.progress import Progress
 from handavatar.train.runs import (
@@ -317,8 +317,7 @@ def begin_training(
     device = chosen_device(options.device)
     avatar.moved_to(device)
     networks = [*avatar.albedo.mlp.parameters(), *avatar.illumination.parameters()]
-    wide = [p for p in networks if method.lr_matrices is not None and is_wide(p)]
-    others = [p for p in networks if all(p is not chosen for chosen in wide)]
+    wide, others = wide_and_narrow(networks) if method.lr_matrices is not None else ([], networks)
     groups: list[dict[str, Any]] = [
         {"params": others, "lr": method.lr},
         {"params": list(avatar.shape.parameters()), "lr": method.lr_shape},
@@ -360,12 +359,12 @@ def _fit_or_restore_outlines(
             method.silhouette_size,
             options.seed,
         )
+        corrected = _corrected(training, frames)
         if method.personal_steps:
-            poses = [frame.pose for frame in _corrected(training, frames)]
+            poses = [frame.pose for frame in corrected]
             fit_occupancy(training.avatar, poses, method.personal_steps, options.seed)
         training.avatar.occupancy.sharpness = method.sharpness
         if method.border_steps:
-            corrected = _corrected(training, frames)
             settings = _settings(method)
             fit_border(training.avatar, corrected, method.border_steps, settings, options.seed)
         tensors = {
