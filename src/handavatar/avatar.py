@@ -38,7 +38,7 @@ from handavatar.render.rasterize import rasterize
 from handavatar.render.sampling import depths_along, intervals_through_boxes
 from handavatar.render.volume import composite_sparse, visibility
 
-SCHEMA = 3
+SCHEMA = 4
 START_LIGHT = 0.65
 """Illumination of an untrained avatar: room to grow brighter and darker."""
 _OF_LICENSED_RIG = ("illumination.position_codes",)
@@ -211,6 +211,9 @@ class HandAvatar(nn.Module):
         self.rounds = rounds
         self.info: dict[str, Any] = dict(info or {})
         self.rig, self.parts = finer_rig(rig, rounds)
+        # Subdivision keeps the vertices it finds, and refinement gives them weights too.
+        skin_weights = self.rig.skin_weights[: rig.num_vertices]
+        self.coarse_rig = replace(rig, skin_weights=skin_weights)
         anchors = anchors or place_anchors(self.rig, num_anchors)
         self.register_buffer("coefficients", coefficients.clone())
         self.register_buffer("anchor_corners", anchors.faces)
@@ -231,6 +234,7 @@ class HandAvatar(nn.Module):
         """Moves weights, rig and parts; returns itself."""
         self.to(device)
         self.base_rig = self.base_rig.to(device)
+        self.coarse_rig = self.coarse_rig.to(device)
         self.rig = self.rig.to(device)
         self.parts = self.parts.to(device)
         return self
@@ -257,7 +261,7 @@ class HandAvatar(nn.Module):
 
     def coarse_personal(self, pose: HandPose) -> ShapedHand:
         """The same before subdivision: its outline is nearly the same and far cheaper."""
-        rest = self.base_rig.shaped(self.coefficients)
+        rest = self.coarse_rig.shaped(self.coefficients)
         return personal_hand(rest, self.shape(rest, pose.rotations))
 
     def prepare(self, pose: HandPose) -> HandState:

@@ -67,6 +67,7 @@ def test_the_result_is_json_and_names_what_was_compared(
         "attention.png",
         *(f"{name}-{seed}.safetensors" for name in rows for seed in (0, 1)),
         *(f"{name}-{seed}" for name in rows for seed in (0, 1)),
+        *(f"{name}-{seed}.json" for name in rows for seed in (0, 1)),
     }
     for gesture in ("flat", "fist"):
         assert value["attention"][gesture]["preference"] > 0

@@ -17,7 +17,7 @@ from handavatar.geometry.meshes import (
     sample_surface_evenly,
 )
 from handavatar.geometry.rotations import apply_rigid, invert_rigid
-from handavatar.hand.detail import subdivided
+from handavatar.hand.detail import refined, subdivided
 from handavatar.hand.pose import BONE_PARENTS, CONNECTED_PAIRS, NUM_BONES
 from handavatar.hand.rig import PosedHand, Rig, RigError
 
@@ -170,12 +170,15 @@ def divide_into_parts(
 def finer_rig(base: Rig, rounds: int) -> tuple[Rig, Parts]:
     """A rig subdivided so many times, and its parts, with points as a prior knows them.
 
+    The finer rig is :func:`handavatar.hand.detail.refined`; which bone owns a vertex is told by the
+    averaged weights, so that the parts do not depend on the refinement.
+
     Raises:
         RigError: as :func:`divide_into_parts`.
     """
     known = subdivided(base, min(rounds, POINT_ROUNDS))
-    rig = subdivided(known, max(rounds - POINT_ROUNDS, 0))
-    return rig, divide_into_parts(rig, drawn_on=known)
+    averaged = subdivided(known, max(rounds - POINT_ROUNDS, 0))
+    return refined(base, rounds), divide_into_parts(averaged, drawn_on=known)
 
 
 def _require_coarser(coarse: Rig, fine: Rig) -> None:

@@ -1,9 +1,12 @@
 """The geometry table: PairOF against other decoders, trained alike and judged on the same poses.
 
 The core of ``handavatar bench --table geometry``. Same poses, shapes, points and labels, same
-number of steps, same seeds, same encoder at the start: only the decoder differs.
+number of steps, same seeds, same encoder at the start: only the decoder differs. What a training
+reached is kept as ``NAME-SEED.json`` beside its weights; where that file is there, with the same
+options, nothing is trained again, so that seeds can be added one by one, on several machines.
 """
 
+import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -34,6 +37,8 @@ from handavatar.train.prior import (
     pose_scores,
     train_prior,
 )
+from handavatar.train.provenance import package_versions, source_commit
+from handavatar.train.runs import write_json
 
 Measure = Callable[[OccupancyField, HandCodes, PosedHand], Mapping[str, float]]
 """Further columns by name, of one field on one posed hand: how good a mesh extracted from it is."""
@@ -49,6 +54,9 @@ class ComparisonOptions:
         priors: folder for the trained priors, their checkpoints and the picture of attention
             maps; a comparison that was begun there with the same options is continued.
         decoders: which ones; ``pair`` must be among them, the others are compared with it.
+        guides: other numbers of subdivisions: COAP's small decoder is trained and judged once more
+            on each, guided and labelled by that mesh alone: the paper's coarse one (0) and its
+            fine one (2).
         seeds: each one trains every decoder once, all on the same data.
         steps: optimisation steps of each training.
         points: labelled points per step.
@@ -62,6 +70,7 @@ class ComparisonOptions:
 
     priors: Path = Path("decoders")
     decoders: tuple[Decoder, ...] = get_args(Decoder)
+    guides: tuple[int, ...] = (0, 2)
     seeds: tuple[int, ...] = (0,)
     steps: int = 10_000
     points: int = 1024
@@ -73,9 +82,28 @@ class ComparisonOptions:
     device: str = "cpu"
 
 
+GUIDED: Decoder = "coap"
+"""The decoder that tells guides apart, as in the paper."""
+
+
+@dataclass(frozen=True)
+class Contender:
+    """One row: a decoder and the mesh that guides it.
+
+    Attributes:
+        decoder: which one.
+        rounds: midpoint subdivisions of the mesh that is encoded, labelled and measured.
+        name: of the row and its files.
+    """
+
+    decoder: Decoder
+    rounds: int
+    name: str
+
+
 @dataclass(frozen=True, eq=False)
 class DecoderScores:
-    """What one decoder reached.
+    """What one contender reached.
 
     Attributes:
         num_parameters: of encoder and decoder.
@@ -86,6 +114,16 @@ class DecoderScores:
     num_parameters: int
     columns: Mapping[str, Float[Tensor, "seeds _"]]
     seconds: float
+
+    @staticmethod
+    def of(trainings: Sequence[Mapping[str, Any]]) -> "DecoderScores":
+        """Joins what the trainings of several seeds reached."""
+        names = trainings[0]["columns"]
+        return DecoderScores(
+            trainings[0]["parameters"],
+            {name: torch.tensor([_figures(row, name) for row in trainings]) for name in names},
+            sum(row["seconds"] for row in trainings) / len(trainings),
+        )
 
 
 def compare_decoders(
@@ -105,7 +143,8 @@ def compare_decoders(
         ``iou_boxes``, ``iou_surface`` in [0, 1], ``iou_points_per_100k``: per cent of IoU for
         100,000 parameters, the measured columns, ``training_seconds``, ``minus_pair``: intervals
         of the paired differences by column, ``minus_pair_over_seeds``: the same over seeds, if
-        there are several), ``control_hurts`` and ``attention`` if those decoders took part.
+        there are several), ``guides`` (rows of the other guides by name, ``minus_coap`` in place
+        of ``minus_pair``), ``control_hurts`` and ``attention`` if those decoders took part.
 
     Raises:
         ValueError: if there is nothing to compare with, or too little to judge by.
@@ -114,44 +153,44 @@ def compare_decoders(
     """
     _check(options)
     options.priors.mkdir(parents=True, exist_ok=True)
-    margin = untrained_field("pair").margin
-    parts, samples = evaluation_poses(
-        PriorEvaluationOptions(
-            poses=options.poses,
-            points=options.judged_points,
-            level=options.level,
-            rounds=options.rounds,
-        ),
-        margin,
-    )
-    results: dict[Decoder, DecoderScores] = {}
+    rows: dict[str, DecoderScores] = {}
+    guides: dict[str, DecoderScores] = {}
     attention: dict[str, Any] = {}
-    for decoder in options.decoders:
-        trained = [_train(options, decoder, seed, report) for seed in options.seeds]
-        fields = [field for field, _ in trained]
-        rows = [_columns(field, parts, samples, options, measures) for field in fields]
-        results[decoder] = DecoderScores(
-            num_parameters=sum(parameter.numel() for parameter in fields[0].parameters()),
-            columns={name: torch.stack([row[name] for row in rows]) for name in rows[0]},
-            seconds=sum(seconds for _, seconds in trained) / len(trained),
-        )
-        if decoder == "transformer" and isinstance(fields[0], PartwiseOccupancy):
-            attention = _attention(fields[0], options)
+    for contender in contenders(options):
+        trainings = [
+            _training(options, contender, seed, measures, report) for seed in options.seeds
+        ]
+        scores = DecoderScores.of(trainings)
+        (rows if contender.rounds == options.rounds else guides)[contender.name] = scores
+        attention = attention or trainings[0].get("attention", {})
     value: dict[str, Any] = {
         "options": {**asdict(options), "priors": options.priors.name},
         "note": "Intervals of 95 % over poses, seeds averaged: they tell poses apart, not "
         "trainings; minus_pair_over_seeds tells trainings apart.",
         "decoders": {
-            name: _summary(scores, results["pair"] if name != "pair" else None)
-            for name, scores in results.items()
+            name: _summary(scores, "pair", None if name == "pair" else rows["pair"])
+            for name, scores in rows.items()
         },
+        "guides": {name: _summary(scores, GUIDED, rows[GUIDED]) for name, scores in guides.items()},
     }
-    if "pair-shuffled" in results:
+    if "pair-shuffled" in rows:
         difference = value["decoders"]["pair-shuffled"]["minus_pair"]["iou"]
         value["control_hurts"] = difference["high"] < 0
     if attention:
         value["attention"] = attention
     return value
+
+
+def contenders(options: ComparisonOptions) -> list[Contender]:
+    """What is trained with every seed: the decoders, and the decoder of the guides with each."""
+    own = [Contender(name, options.rounds, name) for name in options.decoders]
+    if GUIDED not in options.decoders:
+        return own
+    return own + [
+        Contender(GUIDED, rounds, f"{GUIDED}-guide-{rounds}")
+        for rounds in options.guides
+        if rounds != options.rounds
+    ]
 
 
 def comparison_table(value: Mapping[str, Any]) -> ResultTable:
@@ -160,28 +199,36 @@ def comparison_table(value: Mapping[str, Any]) -> ResultTable:
     if "control_hurts" in value:
         hurts = "hurt" if value["control_hurts"] else "do not hurt: the table says nothing"
         notes.append(f"Control: shuffled pairs {hurts}.")
-    rows = {name: _cells(row) for name, row in value["decoders"].items()}
+    rows = {name: _cells(row, "pair") for name, row in value["decoders"].items()}
+    rows |= {name: _cells(row, None) for name, row in value["guides"].items()}
+    for name, row in value["guides"].items():
+        differences = [
+            f"{column} {_interval(interval)}"
+            for column, interval in row[f"minus_{GUIDED}"].items()
+            if math.isfinite(interval["mean"])
+        ]
+        notes.append(f"{name} minus {GUIDED}: {', '.join(differences)}; IoU in [0, 1].")
     return ResultTable("Geometry: decoders of the occupancy field", rows, tuple(notes))
 
 
 _OWN_FIGURES = (
-    *("parameters", "iou", "iou_boxes", "iou_surface", "iou_points_per_100k"),
-    *("training_seconds", "minus_pair", "minus_pair_over_seeds"),
+    *("parameters", "iou", "iou_boxes", "iou_surface", "iou_points_per_100k", "training_seconds"),
+    *("minus_pair", "minus_pair_over_seeds", f"minus_{GUIDED}", f"minus_{GUIDED}_over_seeds"),
 )
 
 
-def _cells(row: Mapping[str, Any]) -> dict[str, Cell]:
-    difference = row.get("minus_pair", {}).get("iou")
-    compared = None
-    if difference is not None:
-        mean, low, high = (100 * difference[key] for key in ("mean", "low", "high"))
-        compared = f"{mean:+.2f} [{low:+.2f}, {high:+.2f}]"
+def _cells(row: Mapping[str, Any], other: str | None) -> dict[str, Cell]:
+    difference = row.get(f"minus_{other}", {}).get("iou")
+    seeds = row.get(f"minus_{other}_over_seeds", {}).get("iou")
     cells: dict[str, Cell] = {
         "parameters": row["parameters"],
         "IoU": round(100 * row["iou"], 2),
         "in boxes": round(100 * row["iou_boxes"], 2),
         "near surface": round(100 * row["iou_surface"], 2),
-        "IoU - pair [95 %]": compared,
+        "IoU - pair [95 % over poses]": None
+        if difference is None
+        else _interval(difference, 100.0),
+        "IoU - pair [95 % over seeds]": None if seeds is None else _interval(seeds, 100.0),
         "IoU per 100K": round(row["iou_points_per_100k"], 1),
     }
     measured = {name: figure for name, figure in row.items() if name not in _OWN_FIGURES}
@@ -191,11 +238,24 @@ def _cells(row: Mapping[str, Any]) -> dict[str, Cell]:
     }
 
 
+def _interval(interval: Mapping[str, float], scale: float = 1.0) -> str:
+    mean, low, high = (scale * interval[key] for key in ("mean", "low", "high"))
+    digits = 2 if scale > 1 else 3
+    return f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]"
+
+
 def _check(options: ComparisonOptions) -> None:
     if "pair" not in options.decoders or len(set(options.decoders)) < 2:
         raise ValueError(
             f"comparison: found the decoders {options.decoders}, expected 'pair' and at least one "
             f"other of {get_args(Decoder)}"
+        )
+    if any(rounds < 0 for rounds in options.guides) or len(set(options.guides)) < len(
+        options.guides
+    ):
+        raise ValueError(
+            f"comparison: found the guides {options.guides}, expected different numbers of "
+            "subdivisions, 0 or more"
         )
     if not options.seeds or len(set(options.seeds)) < len(options.seeds):
         raise ValueError(f"comparison: found the seeds {options.seeds}, expected different ones")
@@ -206,14 +266,28 @@ def _check(options: ComparisonOptions) -> None:
         )
 
 
-def _train(
+def _training(
     options: ComparisonOptions,
-    decoder: Decoder,
+    contender: Contender,
     seed: int,
+    measures: Sequence[Measure],
     report: Callable[[str, int, dict[str, float]], None] | None,
-) -> tuple[OccupancyField, float]:
-    """The trained field on the CPU, and the seconds it took."""
-    name = f"{decoder}-{seed}"
+) -> dict[str, Any]:
+    """What one training reached: read where it is kept, else trained, judged and kept.
+
+    Returns:
+        A value for JSON: ``options`` on which the figures depend, ``versions``, ``commit``,
+        ``parameters``, ``seconds``, ``columns`` by name, and ``attention`` of the Transformer.
+    """
+    name = f"{contender.name}-{seed}"
+    elsewhere = ("priors", "decoders", "guides", "seeds", "device", "rounds")
+    depends_on = {key: value for key, value in asdict(options).items() if key not in elsewhere}
+    depends_on |= {"decoder": contender.decoder, "rounds": contender.rounds, "seed": seed}
+    kept = options.priors / f"{name}.json"
+    if kept.is_file():
+        training: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
+        if training.get("options") == depends_on:
+            return training
     start = time.perf_counter()
     field = train_prior(
         PriorOptions(
@@ -221,15 +295,45 @@ def _train(
             steps=options.steps,
             points=options.points,
             level=options.level,
-            rounds=options.rounds,
+            rounds=contender.rounds,
             seed=seed,
-            decoder=decoder,
+            decoder=contender.decoder,
             folder=options.priors / name,
             device=options.device,
         ),
         None if report is None else lambda step, figures: report(name, step, figures),
+    ).to("cpu")
+    seconds = time.perf_counter() - start
+    parts, samples = evaluation_poses(
+        PriorEvaluationOptions(
+            poses=options.poses,
+            points=options.judged_points,
+            level=options.level,
+            rounds=contender.rounds,
+        ),
+        field.margin,
     )
-    return field.to("cpu"), time.perf_counter() - start
+    columns = _columns(field, parts, samples, options, measures)
+    training = {
+        "options": depends_on,
+        "versions": package_versions(),
+        "commit": source_commit(),
+        "parameters": sum(parameter.numel() for parameter in field.parameters()),
+        "seconds": seconds,
+        "columns": {
+            name: [figure if math.isfinite(figure) else None for figure in values.tolist()]
+            for name, values in columns.items()
+        },
+    }
+    if contender.decoder == "transformer" and isinstance(field, PartwiseOccupancy):
+        training["attention"] = _attention(field, options)
+    write_json(kept, training)
+    return training
+
+
+def _figures(training: Mapping[str, Any], column: str) -> list[float]:
+    """JSON has no NaN: what could not be measured is null there."""
+    return [math.nan if figure is None else figure for figure in training["columns"][column]]
 
 
 def _columns(
@@ -251,8 +355,8 @@ def _columns(
     return columns
 
 
-def _summary(scores: DecoderScores, pair: DecoderScores | None) -> dict[str, Any]:
-    """The means of one decoder and, except for PairOF itself, its distance from PairOF."""
+def _summary(scores: DecoderScores, other: str, others: DecoderScores | None) -> dict[str, Any]:
+    """The means of one row and, unless it is that very row, its distance from another."""
     means = {name: float(values.double().mean()) for name, values in scores.columns.items()}
     summary: dict[str, Any] = {
         "parameters": scores.num_parameters,
@@ -260,14 +364,14 @@ def _summary(scores: DecoderScores, pair: DecoderScores | None) -> dict[str, Any
         "iou_points_per_100k": 100 * means["iou"] / (scores.num_parameters / 100_000),
         "training_seconds": scores.seconds,
     }
-    if pair is None:
+    if others is None:
         return summary
-    differences = {name: values - pair.columns[name] for name, values in scores.columns.items()}
-    summary["minus_pair"] = {
+    differences = {name: values - others.columns[name] for name, values in scores.columns.items()}
+    summary[f"minus_{other}"] = {
         name: asdict(mean_interval(values.mean(0))) for name, values in differences.items()
     }
     if len(next(iter(differences.values()))) > 1:
-        summary["minus_pair_over_seeds"] = {
+        summary[f"minus_{other}_over_seeds"] = {
             name: asdict(mean_interval(values.mean(1))) for name, values in differences.items()
         }
     return summary

@@ -12,7 +12,12 @@ from handavatar.field.decoders import OccupancyField
 from handavatar.field.occupancy import HandCodes
 from handavatar.hand.parts import Parts, divide_into_parts
 from handavatar.hand.rig import PosedHand
-from handavatar.train.comparison import ComparisonOptions, compare_decoders, comparison_table
+from handavatar.train.comparison import (
+    ComparisonOptions,
+    compare_decoders,
+    comparison_table,
+    contenders,
+)
 from handavatar.train.labelled_poses import sample_points
 from handavatar.train.prior import EVALUATION_SEED
 from handavatar.train.prior_measures import measure_field
@@ -33,7 +38,7 @@ class GeometryTableOptions(ComparisonOptions):
     @property
     def total_steps(self) -> int:
         """Of all trainings together."""
-        return self.steps * len(self.seeds) * len(self.decoders)
+        return self.steps * len(self.seeds) * len(contenders(self))
 
 
 class MeshMeasure:
@@ -82,9 +87,7 @@ def geometry_table(
 
     Source: paper Sec. 4.2, table of geometry.
     """
-    done = dict.fromkeys(
-        (f"{decoder}-{seed}" for decoder in options.decoders for seed in options.seeds), 0
-    )
+    done: dict[str, int] = {}
 
     def progress(name: str, step: int, _: dict[str, float]) -> None:
         done[name] = step

@@ -26,6 +26,7 @@ from handavatar.train.border import border_pixels, fit_border
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.labelled_poses import sample_points
 from handavatar.train.losses import border_loss, color_loss, occupancy_loss
+from handavatar.train.muon import Muon
 from handavatar.train.optimizer_state import (
     optimizer_options,
     optimizer_tensors,
@@ -33,7 +34,7 @@ from handavatar.train.optimizer_state import (
 )
 from handavatar.train.outlines import EdgeSet, corrected_pose, fit_outlines, shape_losses
 from handavatar.train.personal_occupancy import fit_occupancy
-from handavatar.train.pretraining import muon, wide_and_narrow
+from handavatar.train.pretraining import wide_and_narrow
 from handavatar.train.prior import SHIPPED_PRIOR, load_prior
 from handavatar.train.progress import Progress
 from handavatar.train.runs import (
@@ -332,7 +333,7 @@ def begin_training(
         ]
     optimizers: dict[str, torch.optim.Optimizer] = {"adam": torch.optim.Adam(groups)}
     if method.lr_matrices is not None:
-        optimizers["muon"] = muon(wide, method.lr_matrices)
+        optimizers["muon"] = Muon(wide, method.lr_matrices)
     for optimizer in optimizers.values():
         for group in optimizer.param_groups:
             group["initial_lr"] = group["lr"]

@@ -175,7 +175,7 @@ def _shape_step(
         pose = corrected_pose(corrections, frame, number, avatar.device)
         camera, mask = frame.camera.to(avatar.device), masks[number].to(avatar.device)
         with torch.enable_grad():
-            rest = avatar.base_rig.shaped(avatar.coefficients)
+            rest = avatar.coarse_rig.shaped(avatar.coefficients)
             offsets = avatar.shape(rest, pose.rotations)
             posed = personal_hand(rest, offsets).posed(pose)
             losses = shape_losses(posed, offsets, camera, mask, edges)
