@@ -16,7 +16,12 @@ from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import divide_into_parts
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand
-from handavatar.train.comparison import ComparisonOptions, compare_decoders, comparison_table
+from handavatar.train.comparison import (
+    ComparisonOptions,
+    compare_decoders,
+    comparison_table,
+    contenders,
+)
 from handavatar.train.geometry_table import GeometryTableOptions, MeshMeasure, geometry_table
 from handavatar.train.prior import PriorEvaluationOptions, evaluate_prior, open_prior
 
@@ -135,6 +140,38 @@ def test_every_decoder_sees_the_same_points(
         assert all(torch.equal(a, b) for a, b in zip(points, seen[0], strict=True))
 
 
+def test_what_is_kept_is_not_trained_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A seed that another machine has measured counts, weights or none."""
+    import handavatar.train.comparison as comparison
+
+    options = replace(_options(tmp_path), decoders=("pair", "coap"), seeds=(3,), guides=())
+    once = compare_decoders(options, (_volume,))
+    for path in tmp_path.glob("*.safetensors"):
+        path.unlink()
+
+    def refused(*_: Any) -> OccupancyField:
+        raise AssertionError("trained again")
+
+    monkeypatch.setattr(comparison, "train_prior", refused)
+    again = compare_decoders(options, (_volume,))
+    assert again == once
+    kept = json.loads((tmp_path / "coap-3.json").read_text())
+    assert kept["options"]["steps"] == 1 and kept["options"]["decoder"] == "coap"
+    assert len(kept["columns"]["iou"]) == 3 and len(kept["columns"]["covered"]) == 2
+    with pytest.raises(AssertionError, match="trained again"):
+        compare_decoders(replace(options, judged_points=128), (_volume,))
+
+
+def test_a_guide_is_compared_with_the_same_decoder(tmp_path: Path) -> None:
+    options = replace(_options(tmp_path), decoders=("pair", "coap"), guides=(0, 1), steps=2)
+    value = compare_decoders(options, (_volume,))
+    assert list(value["guides"]) == ["coap-guide-1"], "0 is the table's own guide"
+    guide, own = value["guides"]["coap-guide-1"], value["decoders"]["coap"]
+    assert guide["minus_coap"]["iou"]["mean"] == pytest.approx(guide["iou"] - own["iou"], abs=1e-6)
+    without = replace(options, decoders=("pair", "transformer"))
+    assert [row.name for row in contenders(without)] == ["pair", "transformer"]
+
+
 def test_impossible_comparisons_are_refused(tmp_path: Path) -> None:
     options = _options(tmp_path / "none")
     for wrong, message in (
@@ -144,6 +181,8 @@ def test_impossible_comparisons_are_refused(tmp_path: Path) -> None:
         (replace(options, seeds=()), "expected different ones"),
         (replace(options, poses=1, measured_poses=1), "two or more"),
         (replace(options, measured_poses=4), "no more measured than judged"),
+        (replace(options, guides=(1, 1)), "different numbers of subdivisions"),
+        (replace(options, guides=(-1,)), "0 or more"),
     ):
         with pytest.raises(ValueError, match=message):
             compare_decoders(wrong)
@@ -154,18 +193,23 @@ def test_impossible_comparisons_are_refused(tmp_path: Path) -> None:
 
 
 def test_the_table_has_a_row_per_decoder_and_says_what_it_rests_on(tmp_path: Path) -> None:
-    wanted = {"decoders": ("pair", "coap"), "steps": 2, "poses": 2, "resolution": 16}
+    wanted = {"decoders": ("pair", "coap"), "guides": (1,)} | {
+        "steps": 2,
+        "poses": 2,
+        "resolution": 16,
+    }
     options = GeometryTableOptions(**(vars(_options(tmp_path)) | wanted))
     told: list[int] = []
     table = geometry_table(options, told.append)
-    assert list(table.rows) == ["pair", "coap"]
+    assert list(table.rows) == ["pair", "coap", "coap-guide-1"]
     assert table.rows["pair"]["parameters"] == 232_513
-    assert table.rows["pair"]["IoU - pair [95 %]"] is None
-    assert "[" in str(table.rows["coap"]["IoU - pair [95 %]"])
+    assert table.rows["pair"]["IoU - pair [95 % over poses]"] is None
+    assert "[" in str(table.rows["coap"]["IoU - pair [95 % over poses]"])
     # Two steps make no hand: what has no surface has no figure, never NaN.
     cells = [cell for row in table.rows.values() for cell in row.values()]
     assert all(not isinstance(cell, float) or math.isfinite(cell) for cell in cells)
-    assert options.total_steps == 4 and max(told, default=0) <= 4
+    assert options.total_steps == 6 and max(told, default=0) <= 6
+    assert any(note.startswith("coap-guide-1 minus coap: iou ") for note in table.notes)
     assert "2 steps of 64 points" in table.markdown()
     assert json.loads(json.dumps(table.record(), allow_nan=False)) is not None
 

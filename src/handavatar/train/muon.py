@@ -5,7 +5,7 @@ AVX2 it took half the time of a step of the prior, and four fifths for wider lay
 the precision of the weights and takes matrices of one shape together.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import torch
@@ -68,7 +68,7 @@ class Muon(torch.optim.Optimizer):
                     )
 
     @torch.no_grad()
-    def step(self, closure: None = None) -> None:  # type: ignore[override]
+    def step(self, closure: Callable[[], float] | None = None) -> None:  # type: ignore[override]
         """One step of every matrix that has a gradient.
 
         Raises:
