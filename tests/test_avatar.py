@@ -1,4 +1,4 @@
-"""The avatar: laws of pictures, the slow plain renderer, exact two-pass gradients, broken files."""
+"""The avatar: laws of pictures, edits, broken files."""
 
 import json
 import math
@@ -10,14 +10,11 @@ import torch
 from conftest import bent_pose, camera_above
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from torch import Tensor
 
 from handavatar.avatar import (
     SCHEMA,
     CheckpointError,
     HandAvatar,
-    HandState,
-    RayValues,
     Rendering,
     RenderSettings,
 )
@@ -27,16 +24,10 @@ from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_throug
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.detail import subdivided
 from handavatar.hand.parts import POINT_ROUNDS, divide_into_parts
-from handavatar.hand.pose import NUM_BONES, HandPose
+from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import Rig
-from handavatar.render.sampling import depths_along, intervals_through_boxes
-from handavatar.render.volume import composite, visibility
 
 FEW = RenderSettings(num_samples=24)
-EVERYTHING = RenderSettings(
-    num_samples=24, smallest_weight=0.0, stop=0.0, coarse=1, mask_margin=math.inf
-)
-"""Nothing is skipped that could weigh anything."""
 
 
 def _assert_equal(first: Rendering, second: Rendering) -> None:
@@ -47,6 +38,10 @@ def _assert_equal(first: Rendering, second: Rendering) -> None:
 @pytest.fixture(scope="module")
 def rendering(small_avatar: HandAvatar) -> Rendering:
     return small_avatar.render(bent_pose(2), camera_above(24), settings=FEW)
+
+
+def _rays(camera: Camera) -> Rays:
+    return rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1))
 
 
 # --- pictures -------------------------------------------------------------------------------------
@@ -236,102 +231,6 @@ def test_an_untrained_avatar_starts_with_the_given_colour(small_avatar: HandAvat
     rendering = avatar.render(bent_pose(0), camera_above(12), settings=FEW)
     seen = rendering.color[rendering.alpha > 0.99]
     torch.testing.assert_close(seen.mean(0), color, atol=0.05, rtol=0)
-
-
-# --- the slow plain renderer ----------------------------------------------------------------------
-
-
-def _rays(camera: Camera) -> Rays:
-    return rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1))
-
-
-def _rendered_plainly(
-    avatar: HandAvatar, state: HandState, rays: Rays, num_samples: int
-) -> RayValues:
-    """Equations 2 to 4 at every sample of every ray, every pair decoded, nothing skipped."""
-    boxes = state.codes.boxes
-    near, far, is_hit = intervals_through_boxes(
-        rays, boxes.bone_from_world, boxes.lower - boxes.margin, boxes.upper + boxes.margin
-    )
-    near, far = torch.where(is_hit, near, 0.1), torch.where(is_hit, far, 0.2)
-    depths = depths_along(near, far, num_samples)
-    points = rays.origins[:, None] + depths[..., None] * rays.directions[:, None]
-    points = points.flatten(0, 1)
-    pieces = [avatar.occupancy.plain(state.codes, piece) for piece in points.split(512)]
-    occupancy = torch.cat([piece[0] for piece in pieces]).view(depths.shape)
-    soft = torch.cat([piece[1] for piece in pieces]).view(*depths.shape, NUM_BONES).detach()
-    met = [soft[:, 0]]
-    for sample in range(1, num_samples):
-        met.append(torch.maximum(met[-1], soft[:, sample]))
-    directed = torch.stack(met, dim=1).flatten(0, 1)
-
-    distances = (points[:, None] - state.anchors).norm(dim=-1)
-    distances, indices = distances.topk(4, largest=False)
-    weights = 1 / distances.clamp_min(1e-5)
-    weights = (weights / weights.sum(-1, keepdim=True))[..., None]
-    albedo = avatar.albedo.mlp((weights * avatar.albedo.codes[indices]).sum(1)).sigmoid()
-    places = (weights * avatar.illumination.position_codes[indices]).sum(1)
-    pose = state.posed.pose.rotations.flatten().expand(len(places), -1)
-    light = avatar.illumination.mlp(torch.cat([directed, places, pose], dim=-1)).sigmoid()
-    normals = (weights * state.anchor_normals[indices]).sum(1)
-    values = torch.cat(
-        [albedo * light, albedo, light, normals, depths.flatten()[:, None], torch.ones_like(light)],
-        dim=-1,
-    )
-    total = composite(visibility(occupancy), values.view(*depths.shape, -1)) * is_hit[:, None]
-    color, albedo, light, normal, depth, alpha = total.split([3, 3, 1, 3, 1, 1], dim=-1)
-    return RayValues(color, albedo, light[:, 0], normal, depth[:, 0], alpha[:, 0])
-
-
-def test_skipping_nothing_equals_the_plain_renderer(small_avatar: HandAvatar) -> None:
-    rays = _rays(camera_above(10))
-    with torch.no_grad():
-        state = small_avatar.prepare(bent_pose(2))
-        found = small_avatar.render_rays(state, rays, EVERYTHING)
-        expected = _rendered_plainly(small_avatar, state, rays, 24)
-    for name, value in vars(expected).items():
-        # Fast and plain occupancies differ by 2e-5 at most (tests/field/test_occupancy.py), and so
-        # does each of the few samples of a ray that are neither empty nor behind the surface.
-        torch.testing.assert_close(getattr(found, name), value, atol=5e-5, rtol=0)
-        assert float((getattr(found, name) - value).abs().mean()) < 1e-6
-
-
-def test_the_default_settings_lose_less_than_can_be_seen(small_avatar: HandAvatar) -> None:
-    """70 dB is an error of 0.08 of the 255 steps of a pixel."""
-    pose, camera = bent_pose(2), camera_above(12)
-    with torch.no_grad():
-        state = small_avatar.prepare(pose)
-        expected = _rendered_plainly(small_avatar, state, _rays(camera), 64)
-        found = small_avatar.render(pose, camera, settings=RenderSettings(edge_rays=1))
-    for name in ("color", "albedo", "alpha"):
-        error = getattr(found, name).flatten(0, 1) - getattr(expected, name).view(144, -1).squeeze(
-            -1
-        )
-        assert -10 * math.log10(float(error.square().mean()) + 1e-12) > 70, name
-
-
-def _scalar(values: RayValues) -> Tensor:
-    generator = torch.Generator().manual_seed(3)
-    return sum(
-        (torch.randn(value.shape, generator=generator) * value).sum()
-        for value in vars(values).values()
-    )
-
-
-def test_the_two_pass_gradient_is_the_whole_gradient(small_avatar: HandAvatar) -> None:
-    """Evaluated first without gradient, then again where it can be seen: nothing is lost."""
-    rays = _rays(camera_above(8))
-    parameters = dict(small_avatar.named_parameters())
-    seen = small_avatar.render_rays(small_avatar.prepare(bent_pose(2)), rays, EVERYTHING)
-    found = torch.autograd.grad(_scalar(seen), list(parameters.values()))
-    state = small_avatar.prepare(bent_pose(2))
-    plain = _rendered_plainly(small_avatar, state, rays, 24)
-    expected = torch.autograd.grad(_scalar(plain), list(parameters.values()))
-    for name, ours, theirs in zip(parameters, found, expected, strict=True):
-        assert float(theirs.norm()) > 0 or name.endswith("bias"), name
-        # float32 through a dozen layers and back. The offsets' common shift is undone at the wrist:
-        # its gradient (shape.mlp.output.bias) is a sum that cancels, known to 1e-5.
-        assert float((ours - theirs).norm()) <= 1e-4 * float(theirs.norm()) + 1e-5, name
 
 
 # --- edits ----------------------------------------------------------------------------------------

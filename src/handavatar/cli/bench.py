@@ -33,12 +33,18 @@ def _geometry() -> _Bench:
     return _Bench(GeometryTableOptions, geometry_table)
 
 
-_TABLES: dict[str, Callable[[], _Bench]] = {"geometry": _geometry, "skin": _skin}
+def _speed() -> _Bench:
+    from handavatar.evaluate.speed_table import SpeedTableOptions, speed_table
+
+    return _Bench(SpeedTableOptions, speed_table)
+
+
+_TABLES: dict[str, Callable[[], _Bench]] = {"geometry": _geometry, "skin": _skin, "speed": _speed}
 """A new table needs a line here; what it takes and makes is the business of its own module."""
 
 
 def bench(words: list[str]) -> int:
-    """Measure one of the paper's tables: ``bench --table geometry|skin``."""
+    """Measure one of the paper's tables: ``bench --table geometry|skin|speed``."""
     from handavatar.cli.arguments import JSON, Extra, parse_with, print_json
     from handavatar.train.progress import Progress
 

@@ -1,0 +1,391 @@
+"""The table of speed: the plain reference against the fast ways of making the same picture.
+
+All in one run, on the same poses, at the same places of the rays. The plain reference costs the
+same for every ray, so it is timed on some rays of each picture, drawn at random, and scaled to all.
+"""
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Int
+from torch import Tensor, nn
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import FlopCounterMode
+
+from handavatar.avatar import HandAvatar, HandState, RayValues, RenderSettings
+from handavatar.evaluate.tables import Cell, ResultTable
+from handavatar.geometry.cameras import Camera, Rays, look_at, pixel_centers, rays_through_pixels
+from handavatar.hand.pose import HandPose
+from handavatar.hand.pose_sampling import GESTURES, gesture_rotations
+from handavatar.plain import plain_rays
+
+EXACT = RenderSettings(smallest_weight=1e-7, stop=1e-7, coarse=1, mask_margin=math.inf, edge_rays=1)
+"""Leaves out what provably weighs nothing: at most 64 times 1e-7, and what no part box holds."""
+NEAR_EXACT = RenderSettings(edge_rays=1)
+"""As pictures are rendered by default, but with one ray a pixel like the reference."""
+_VIEWS = ((0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (0.0, -0.7, 0.7), (0.0, 0.7, 0.7))
+"""Where the camera stands, in turn: palm, back and two sides, in the hand's rest axes."""
+_DISTANCE = 0.6
+_ROOM = 1.3
+"""The picture's side for a hand's side, as in the authors' crops."""
+_COUNTED_RAYS = 64
+
+
+@dataclass(frozen=True)
+class SpeedTableOptions:
+    """What is timed.
+
+    Attributes:
+        avatar: a trained one: how much can be left out depends on what it has learned.
+        size: pixels along a side of the pictures.
+        poses: gestures, one picture of each.
+        plain_rays: rays of each picture that the plain reference evaluates.
+        plain_points: points at a time of the plain reference; the best of these counts.
+        sizes: pixels along a side, of one pose, by the fast ways alone.
+    """
+
+    avatar: Path
+    size: int = 256
+    poses: int = 8
+    plain_rays: int = 512
+    plain_points: tuple[int, ...] = (512, 1024, 2048)
+    sizes: tuple[int, ...] = (64, 128, 256, 512)
+
+    @property
+    def total_steps(self) -> int:
+        """Pictures and the choice of the reference's pieces."""
+        return self.poses + len(self.plain_points) + len(self.sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One pose, its camera, and rays of the picture that every way evaluates.
+
+    Attributes:
+        pose: of the hand.
+        camera: of the picture.
+        state: what all rays share.
+        pixels: numbers of the chosen pixels, row by row.
+        rays: through them.
+    """
+
+    pose: HandPose
+    camera: Camera
+    state: HandState
+    pixels: Int[Tensor, "rays"]
+    rays: Rays
+
+
+def speed_table(
+    options: SpeedTableOptions, report: Callable[[int], None] | None = None
+) -> ResultTable:
+    """Times the plain reference, the exact and the near-exact way side by side.
+
+    Args:
+        options: what to time.
+        report: told the number of pieces of work done.
+
+    Raises:
+        CheckpointError: if the avatar cannot be read.
+        ValueError: if there are fewer rays or poses than can be chosen.
+    """
+    if not 1 <= options.poses <= len(GESTURES):
+        raise ValueError(f"--poses: found {options.poses}, expected 1 to {len(GESTURES)}")
+    if not 1 <= options.plain_rays <= options.size**2:
+        raise ValueError(
+            f"--plain-rays: found {options.plain_rays}, expected 1 to {options.size**2}"
+        )
+    avatar = HandAvatar.load(options.avatar)
+    done = 0
+
+    def finished() -> None:
+        nonlocal done
+        done += 1
+        if report is not None:
+            report(done)
+
+    with torch.no_grad():
+        scenes = [
+            _scene(avatar, name, number, options)
+            for number, name in enumerate(list(GESTURES)[: options.poses])
+        ]
+        points_at_once = _best_pieces(avatar, scenes[0], options, finished)
+        timings = {name: Timings() for name in ("plain", "exact", "near-exact")}
+        for scene in scenes:
+            _time_scene(avatar, scene, points_at_once, timings)
+            finished()
+        counts = _counts(avatar, scenes[0], points_at_once)
+        rows = {
+            name: _row(timing, timings["plain"], counts[name], options)
+            for name, timing in timings.items()
+        }
+        scaling = []
+        for size in options.sizes:
+            scaling.append(_seconds_of_size(avatar, scenes[0], size))
+            finished()
+    peak = _peak_flops()
+    notes = (
+        f"{len(scenes)} poses of {options.size}x{options.size} pixels, {torch.get_num_threads()} "
+        f"threads; the plain reference on {options.plain_rays} rays of each, scaled to all, "
+        f"{points_at_once} points at a time (the best of {list(options.plain_points)}).",
+        "Ratio: seconds of the plain reference for all poses over those of the row [least, most of "
+        "a single pose]. Errors: of the colour at the reference's rays, at the same places along "
+        "them; PSNR over these rays.",
+        f"TFLOP of matrix products and GB through memory, every operation's operands and result, "
+        f"of the first pose; this machine reaches {peak / 1e9:,.0f} GFLOP/s in a product of two "
+        "2048x2048 matrices.",
+        "Seconds by size of the picture, first pose, exact and near-exact: "
+        + "; ".join(
+            f"{size}: {exact:.2f} and {near:.2f}"
+            for size, (exact, near) in zip(options.sizes, scaling, strict=True)
+        )
+        + ".",
+    )
+    for row in rows.values():
+        tera, seconds = row["TFLOP"], row["s of the first pose"]
+        assert isinstance(tera, float) and isinstance(seconds, float)
+        row["% of peak"] = round(100 * tera * 1e12 / seconds / peak, 1)
+    return ResultTable("Speed of rendering", rows, notes)
+
+
+# --- scenes ---------------------------------------------------------------------------------------
+
+
+def framing_camera(
+    vertices: torch.Tensor, direction: tuple[float, float, float], size: int
+) -> Camera:
+    """A camera that sees all vertices with some room around them.
+
+    Args:
+        vertices: world, metres.
+        direction: from the hand's middle to the camera.
+        size: pixels along a side.
+    """
+    lower, upper = vertices.amin(0), vertices.amax(0)
+    middle, reach = (lower + upper) / 2, float((upper - lower).max())
+    towards = nn.functional.normalize(torch.tensor(direction), dim=0)
+    focal = size * (_DISTANCE - reach / 2) / (_ROOM * reach)
+    pose = look_at(middle + _DISTANCE * towards, middle, torch.tensor([-1.0, 0.0, 0.0]))
+    return Camera((focal, focal), (size / 2, size / 2), size, size, pose)
+
+
+def _scene(avatar: HandAvatar, gesture: str, number: int, options: SpeedTableOptions) -> Scene:
+    pose = HandPose(gesture_rotations(avatar.base_rig, gesture), torch.zeros(3))
+    state = avatar.prepare(pose)
+    camera = framing_camera(state.posed.vertices, _VIEWS[number % len(_VIEWS)], options.size)
+    generator = torch.Generator().manual_seed(number)
+    pixels = torch.randperm(options.size**2, generator=generator)[: options.plain_rays]
+    rays = rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1)[pixels])
+    return Scene(pose, camera, state, pixels, rays)
+
+
+# --- timing ---------------------------------------------------------------------------------------
+
+
+class Timings:
+    """What one way took and how far it is from the reference, pose by pose."""
+
+    def __init__(self) -> None:
+        """Nothing yet."""
+        self.seconds: list[float] = []
+        self.largest: list[float] = []
+        self.squared: list[float] = []
+        self.stages: dict[str, float] = {}
+
+    def add(
+        self, seconds: float, found: RayValues, truth: RayValues, stages: dict[str, float]
+    ) -> None:
+        """Takes note of one picture."""
+        error = (found.color - truth.color).double()
+        self.seconds.append(seconds)
+        self.largest.append(float(error.abs().max()))
+        self.squared.append(float(error.square().mean()))
+        for name, spent in stages.items():
+            self.stages[name] = self.stages.get(name, 0.0) + spent
+
+
+def _best_pieces(
+    avatar: HandAvatar, scene: Scene, options: SpeedTableOptions, finished: Callable[[], None]
+) -> int:
+    """The number of points at a time with which the plain reference is quickest."""
+    few = Rays(scene.rays.origins[:_COUNTED_RAYS], scene.rays.directions[:_COUNTED_RAYS])
+    spent = {}
+    for count in options.plain_points:
+        begin = time.perf_counter()
+        plain_rays(avatar, scene.state, few, points_at_once=count)
+        spent[count] = time.perf_counter() - begin
+        finished()
+    return min(spent, key=spent.__getitem__)
+
+
+def _time_scene(
+    avatar: HandAvatar, scene: Scene, points_at_once: int, timings: dict[str, Timings]
+) -> None:
+    """One picture in each way, one after the other, so that all meet the same machine."""
+    scale = scene.camera.width * scene.camera.height / len(scene.pixels)
+    with _stages(avatar) as stages:
+        begin = time.perf_counter()
+        truth = plain_rays(avatar, scene.state, scene.rays, points_at_once=points_at_once)
+        seconds = scale * (time.perf_counter() - begin)
+        spent = {name: scale * value for name, value in stages.items()}
+    timings["plain"].add(seconds, truth, truth, spent)
+    for name, settings in (("exact", EXACT), ("near-exact", NEAR_EXACT)):
+        with _stages(avatar) as stages:
+            begin = time.perf_counter()
+            avatar.render(scene.pose, scene.camera, settings=settings)
+            seconds = time.perf_counter() - begin
+        timings[name].add(seconds, _at_pixels(avatar, scene, settings), truth, dict(stages))
+
+
+def _at_pixels(avatar: HandAvatar, scene: Scene, settings: RenderSettings) -> RayValues:
+    """The chosen pixels as ``render`` would show them, at exactly the reference's places."""
+    near = avatar.near_mesh(scene.state, scene.camera, settings.mask_margin).flatten()
+    values = avatar.render_rays(scene.state, scene.rays, settings)
+    is_seen = near[scene.pixels]
+    return RayValues(
+        **{
+            name: torch.where(is_seen.view(-1, *(1,) * (value.ndim - 1)), value, 0.0)
+            for name, value in vars(values).items()
+        }
+    )
+
+
+@contextmanager
+def _stages(avatar: HandAvatar) -> Iterator[dict[str, float]]:
+    """Seconds inside the fields, by name, of what runs in the block."""
+    spent: dict[str, float] = {}
+    begun: list[float] = []
+    handles = []
+    # The plain evaluation calls the decoder, the fast one the field as a whole.
+    occupancy = {"occupancy": avatar.occupancy, "plain occupancy": avatar.occupancy.decoder}
+    fields: dict[str, nn.Module] = {
+        **occupancy,
+        "albedo": avatar.albedo,
+        "illumination": avatar.illumination,
+        "encoder": avatar.occupancy.encoder,
+        "shape": avatar.shape,
+    }
+    for name, module in fields.items():
+
+        def before(*_: Any) -> None:
+            begun.append(time.perf_counter())
+
+        def after(*_: Any, name: str = name.removeprefix("plain ")) -> None:
+            spent[name] = spent.get(name, 0.0) + time.perf_counter() - begun.pop()
+
+        handles += [
+            module.register_forward_pre_hook(before),
+            module.register_forward_hook(after),
+        ]
+    try:
+        yield spent
+    finally:
+        for handle in handles:
+            handle.remove()
+
+
+def _seconds_of_size(avatar: HandAvatar, scene: Scene, size: int) -> tuple[float, float]:
+    """Of the exact and of the near-exact way."""
+    camera, spent = scene.camera.resized(size, size), []
+    for settings in (EXACT, NEAR_EXACT):
+        begin = time.perf_counter()
+        avatar.render(scene.pose, camera, settings=settings)
+        spent.append(time.perf_counter() - begin)
+    return spent[0], spent[1]
+
+
+# --- counting -------------------------------------------------------------------------------------
+
+
+class _Traffic(TorchDispatchMode):
+    """Adds up the bytes of every operation's operands and results."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.total = 0
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        result = func(*args, **(kwargs or {}))
+        # A view moves nothing.
+        if not func.is_view:
+            leaves = torch.utils._pytree.tree_leaves((args, kwargs, result))
+            self.total += sum(
+                leaf.numel() * leaf.element_size() for leaf in leaves if torch.is_tensor(leaf)
+            )
+        return result
+
+
+def _counts(
+    avatar: HandAvatar, scene: Scene, points_at_once: int
+) -> dict[str, tuple[float, float]]:
+    """Floating-point operations and bytes of the first pose's picture, by way."""
+    few = Rays(scene.rays.origins[:_COUNTED_RAYS], scene.rays.directions[:_COUNTED_RAYS])
+    scale = scene.camera.width * scene.camera.height / len(few.origins)
+
+    def plain() -> None:
+        plain_rays(avatar, scene.state, few, points_at_once=points_at_once)
+
+    counted = {"plain": (scale, _counted(plain))}
+    for name, settings in (("exact", EXACT), ("near-exact", NEAR_EXACT)):
+
+        def fast(settings: RenderSettings = settings) -> None:
+            avatar.render(scene.pose, scene.camera, settings=settings)
+
+        counted[name] = (1.0, _counted(fast))
+    return {
+        name: (factor * flops, factor * traffic)
+        for name, (factor, (flops, traffic)) in counted.items()
+    }
+
+
+def _counted(work: Callable[[], None]) -> tuple[int, int]:
+    """Floating-point operations and bytes; on one thread, since the counters see only their own."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with _Traffic() as traffic, FlopCounterMode(display=False) as flops:
+            work()
+    finally:
+        torch.set_num_threads(threads)
+    return flops.get_total_flops(), traffic.total
+
+
+def _peak_flops(size: int = 2048, tries: int = 3) -> float:
+    """Operations a second of a large product of 32-bit matrices, the best of some tries."""
+    left, right = torch.rand(size, size), torch.rand(size, size)
+    spent = []
+    for _ in range(tries):
+        begin = time.perf_counter()
+        left @ right
+        spent.append(time.perf_counter() - begin)
+    return 2 * size**3 / min(spent)
+
+
+def _row(
+    timing: Timings, plain: Timings, counts: tuple[float, float], options: SpeedTableOptions
+) -> dict[str, Cell]:
+    ratios = [theirs / ours for theirs, ours in zip(plain.seconds, timing.seconds, strict=True)]
+    mean = sum(timing.squared) / len(timing.squared)
+    total = sum(timing.seconds)
+    row: dict[str, Cell] = {
+        "s a picture": round(total / options.poses, 3),
+        "ratio": f"{sum(plain.seconds) / total:.1f} [{min(ratios):.1f}, {max(ratios):.1f}]",
+        "max error": None if timing is plain else float(f"{max(timing.largest):.1e}"),
+        "PSNR": None if mean == 0 else round(-10 * math.log10(mean), 1),
+    }
+    row |= {
+        f"{name} %": round(100 * timing.stages.get(name, 0.0) / total, 1)
+        for name in ("shape", "encoder", "occupancy", "albedo", "illumination")
+    }
+    row["TFLOP"] = round(counts[0] / 1e12, 4)
+    row["GB"] = round(counts[1] / 1e9, 2)
+    row["s of the first pose"] = round(timing.seconds[0], 3)
+    return row
