@@ -25,7 +25,7 @@ MAY_IMPORT = {
         # The slow renderer that the fast one is measured against.
         "plain": "geometry field render avatar",
         "evaluate": "geometry hand capture avatar alignment plain",
-        "train": "geometry hand capture field render avatar alignment evaluate",
+        "train": "geometry hand capture field render avatar plain alignment evaluate",
         "export": "geometry hand capture edit avatar",
         "view": "geometry hand capture edit avatar",
         # Motions to pictures: what a viewer may see, and the rasteriser's neighbours.

@@ -29,9 +29,10 @@ EXACTLY = {
     "hand.detail": "refined subdivided",
     "edit": "Edit bones_named",
     "avatar": (
-        "CheckpointError HandAvatar HandState RayValues RenderSettings Rendering "
+        "CheckpointError EXACT HandAvatar HandState RayValues RenderSettings Rendering "
         "SCHEMA START_LIGHT VisibleSamples chosen_device"
     ),
+    "plain": "NUM_NEIGHBOURS plain_rays",
     "capture.default": "default_capture",
 }
 AT_LEAST = {

@@ -104,6 +104,11 @@ class RenderSettings:
     rays_at_once: int = 4096
 
 
+EXACT = RenderSettings(smallest_weight=1e-7, stop=1e-7, coarse=1, mask_margin=math.inf)
+"""Leaves out only what provably weighs next to nothing: samples of less than 1e-7, what lies behind
+such darkness, and what no part box holds, where there is no hand by definition."""
+
+
 @dataclass(frozen=True, eq=False)
 class HandState:
     """Everything about one pose that all rays share.

@@ -2,6 +2,7 @@
 
 import math
 
+import pytest
 import torch
 
 from handavatar.field.layers import MLP, PointNet, ResidualBlock, SkipMLP, positional_encoding
@@ -43,6 +44,25 @@ def test_an_unpooled_pointnet_follows_the_order() -> None:
     features = network(points)
     assert features.shape == (3, 2, 64)
     torch.testing.assert_close(network(points.flip(1)), features.flip(1))
+
+
+@pytest.mark.parametrize("is_pooled", [True, False])
+def test_the_factorised_pointnet_is_the_same_function_with_the_same_gradient(
+    is_pooled: bool,
+) -> None:
+    torch.manual_seed(0)
+    network = PointNet(6, is_pooled=is_pooled).double()
+    for block in network.blocks:  # They start as their shortcuts; the rest must count too.
+        torch.nn.init.normal_(block.outer.weight, std=0.1)  # type: ignore[union-attr,arg-type]
+    points = torch.randn(3, 20, 6, dtype=torch.float64, requires_grad=True)
+    wanted = [points, *network.parameters()]
+    found, expected = network.factorised(points), network(points)
+    torch.testing.assert_close(found, expected)
+    scale = torch.randn_like(expected)
+    gradients = [torch.autograd.grad((scale * value).sum(), wanted) for value in (found, expected)]
+    for ours, theirs in zip(*gradients, strict=True):
+        assert bool(theirs.any())
+        torch.testing.assert_close(ours, theirs)
 
 
 def test_depth_counts_hidden_layers() -> None:

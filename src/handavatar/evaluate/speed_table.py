@@ -8,7 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +18,18 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from handavatar.avatar import HandAvatar, HandState, RayValues, RenderSettings
+from handavatar.avatar import EXACT, HandAvatar, HandState, RayValues, RenderSettings
 from handavatar.evaluate.tables import Cell, ResultTable
 from handavatar.geometry.cameras import Camera, Rays, look_at, pixel_centers, rays_through_pixels
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import GESTURES, gesture_rotations
 from handavatar.plain import plain_rays
 
-EXACT = RenderSettings(smallest_weight=1e-7, stop=1e-7, coarse=1, mask_margin=math.inf, edge_rays=1)
-"""Leaves out what provably weighs nothing: at most 64 times 1e-7, and what no part box holds."""
-NEAR_EXACT = RenderSettings(edge_rays=1)
-"""As pictures are rendered by default, but with one ray a pixel like the reference."""
+_WAYS = {
+    "exact": replace(EXACT, edge_rays=1),
+    "near-exact": RenderSettings(edge_rays=1),
+}
+"""As ``render --quality`` has them, but with one ray a pixel like the reference."""
 _VIEWS = ((0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (0.0, -0.7, 0.7), (0.0, 0.7, 0.7))
 """Where the camera stands, in turn: palm, back and two sides, in the hand's rest axes."""
 _DISTANCE = 0.6
@@ -116,7 +117,7 @@ def speed_table(
             for number, name in enumerate(list(GESTURES)[: options.poses])
         ]
         points_at_once = _best_pieces(avatar, scenes[0], options, finished)
-        timings = {name: Timings() for name in ("plain", "exact", "near-exact")}
+        timings = {name: Timings() for name in ("plain", *_WAYS)}
         for scene in scenes:
             _time_scene(avatar, scene, points_at_once, timings)
             finished()
@@ -235,7 +236,7 @@ def _time_scene(
         seconds = scale * (time.perf_counter() - begin)
         spent = {name: scale * value for name, value in stages.items()}
     timings["plain"].add(seconds, truth, truth, spent)
-    for name, settings in (("exact", EXACT), ("near-exact", NEAR_EXACT)):
+    for name, settings in _WAYS.items():
         with _stages(avatar) as stages:
             begin = time.perf_counter()
             avatar.render(scene.pose, scene.camera, settings=settings)
@@ -293,7 +294,7 @@ def _stages(avatar: HandAvatar) -> Iterator[dict[str, float]]:
 def _seconds_of_size(avatar: HandAvatar, scene: Scene, size: int) -> tuple[float, float]:
     """Of the exact and of the near-exact way."""
     camera, spent = scene.camera.resized(size, size), []
-    for settings in (EXACT, NEAR_EXACT):
+    for settings in _WAYS.values():
         begin = time.perf_counter()
         avatar.render(scene.pose, camera, settings=settings)
         spent.append(time.perf_counter() - begin)
@@ -333,20 +334,20 @@ def _counts(
     def plain() -> None:
         plain_rays(avatar, scene.state, few, points_at_once=points_at_once)
 
-    counted = {"plain": (scale, _counted(plain))}
-    for name, settings in (("exact", EXACT), ("near-exact", NEAR_EXACT)):
+    found = {"plain": (scale, counted(plain))}
+    for name, settings in _WAYS.items():
 
         def fast(settings: RenderSettings = settings) -> None:
             avatar.render(scene.pose, scene.camera, settings=settings)
 
-        counted[name] = (1.0, _counted(fast))
+        found[name] = (1.0, counted(fast))
     return {
         name: (factor * flops, factor * traffic)
-        for name, (factor, (flops, traffic)) in counted.items()
+        for name, (factor, (flops, traffic)) in found.items()
     }
 
 
-def _counted(work: Callable[[], None]) -> tuple[int, int]:
+def counted(work: Callable[[], None]) -> tuple[int, int]:
     """Floating-point operations and bytes; on one thread, since the counters see only their own."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -2,6 +2,7 @@
 
 import math
 from itertools import pairwise
+from typing import cast
 
 import torch
 from jaxtyping import Float
@@ -100,6 +101,19 @@ class ResidualBlock(nn.Module):
         """Applies the block to the last axis."""
         return self.outer(self.inner(inputs.relu()).relu()) + self.shortcut(inputs)
 
+    def of_set(
+        self,
+        features: Float[Tensor, "*batch points width"],
+        pooled: Float[Tensor, "*batch width"],
+    ) -> Float[Tensor, "*batch points out"]:
+        """The block on every ``[feature, pooled]``, with the pooled half computed once per set."""
+        width = features.shape[-1]
+        own, common = self.inner.weight.split(width, dim=1)
+        shared = pooled.relu() @ common.T + self.inner.bias
+        hidden = (features.relu() @ own.T + shared[..., None, :]).relu()
+        own, common = self.shortcut.weight.split(width, dim=1)
+        return self.outer(hidden) + features @ own.T + (pooled @ common.T)[..., None, :]
+
 
 class PointNet(nn.Module):
     """Residual PointNet: four blocks, each but the last followed by a maximum over the points.
@@ -118,13 +132,24 @@ class PointNet(nn.Module):
 
     def forward(self, points: Float[Tensor, "*batch points width_in"]) -> Tensor:
         """``(*batch, width)`` if pooled, else ``(*batch, points, width)``."""
-        return self.after_first_block(self.blocks[0](self.input(points)))
-
-    def after_first_block(self, features: Float[Tensor, "*batch points width"]) -> Tensor:
-        """The rest of the network, from the first maximum over the points on."""
+        features = self.blocks[0](self.input(points))
         for block in list(self.blocks)[1:]:
             pooled = features.amax(-2, keepdim=True).expand_as(features)
             features = block(torch.cat([features, pooled], dim=-1))
         if self.is_pooled:
             features = features.amax(-2)
         return self.output(features.relu())
+
+    def factorised(self, points: Float[Tensor, "*batch points width_in"]) -> Tensor:
+        """The same, with what all points of a set share computed once: two fifths less work."""
+        features = self.blocks[0](self.input(points))
+        for block in self.set_blocks:
+            features = block.of_set(features, features.amax(-2))
+        if self.is_pooled:
+            features = features.amax(-2)
+        return self.output(features.relu())
+
+    @property
+    def set_blocks(self) -> list[ResidualBlock]:
+        """The blocks that see a maximum over the points beside each of them."""
+        return cast(list[ResidualBlock], list(self.blocks)[1:])

@@ -282,11 +282,9 @@ class PairOccupancy(nn.Module):
         With the items that :meth:`forward` found to decide, value and gradient equal those of
         the full evaluation, at a fraction of the work.
         """
-        logits = self._decode(codes, points, items)
+        logits = self._wanted_logits(codes, points, items)
         slots = (items.points[:, None] * NUM_BONES + self.pairs[items.pairs])[items.is_wanted]
-        parts = self.fusion.over_pairs(
-            logits[items.is_wanted], slots, len(points) * NUM_BONES, slope=self.sharpness
-        )
+        parts = self.fusion.over_pairs(logits, slots, len(points) * NUM_BONES, slope=self.sharpness)
         return self.fusion.over_parts(parts.view(-1, NUM_BONES))
 
     def plain(
@@ -321,6 +319,29 @@ class PairOccupancy(nn.Module):
         position = points[items.points][:, None, :, None]
         queries = (transforms[..., :3, :3] @ position)[..., 0] + transforms[..., :3, 3]
         return self.decoder(codes.part_codes[members], queries * LENGTH_SCALE)
+
+    def _wanted_logits(
+        self, codes: HandCodes, points: Float[Tensor, "points 3"], items: PairItems
+    ) -> Float[Tensor, "wanted"]:
+        """The wanted answers of :meth:`_decode` with gradient, by exact algebra.
+
+        The constant part code enters the first layer as a bias; the pooled half of every later
+        block runs once per pair; the last block and the MLP run for wanted answers only.
+        """
+        members = self.pairs[items.pairs]
+        transforms = codes.boxes.bone_from_world[members]
+        position = points[items.points][:, None, :, None]
+        queries = (transforms[..., :3, :3] @ position)[..., 0] + transforms[..., :3, 3]
+        network = self.decoder.pointnet
+        of_code, of_query = network.input.weight.split((CODE_WIDTH, 3), dim=1)
+        biases = codes.part_codes @ of_code.T + network.input.bias
+        tokens = network.blocks[0](biases[members] + (LENGTH_SCALE * queries) @ of_query.T)
+        *between, last = network.set_blocks
+        for block in between:
+            tokens = block.of_set(tokens, tokens.amax(-2))
+        item = items.is_wanted.nonzero()[:, 0]
+        answers = last.of_set(tokens[items.is_wanted][:, None], tokens.amax(-2)[item])[:, 0]
+        return LOGIT_SCALE * self.decoder.mlp(network.output(answers.relu()))[:, 0]
 
     def _chunk_occupancy(self, codes: HandCodes, points: Float[Tensor, "points 3"]) -> Occupancy:
         """The fast evaluation: the same function as :meth:`plain`, by exact algebra.
@@ -407,7 +428,7 @@ def hand_codes(encoder: PointNet, parts: Parts, posed: PosedHand, margin: float)
     """
     clouds = parts.point_clouds(posed)
     scaled = torch.cat([clouds[..., :3] * LENGTH_SCALE, clouds[..., 3:]], dim=-1)
-    return HandCodes(encoder(scaled), parts.boxes(posed, margin))
+    return HandCodes(encoder.factorised(scaled), parts.boxes(posed, margin))
 
 
 def local_points(

@@ -366,7 +366,7 @@ def _fit_or_restore_outlines(
             fit_occupancy(training.avatar, poses, method.personal_steps, options.seed)
         training.avatar.occupancy.sharpness = method.sharpness
         if method.border_steps:
-            settings = _settings(method)
+            settings = learned_rays(method.num_samples)
             fit_border(training.avatar, corrected, method.border_steps, settings, options.seed)
         tensors = {
             f"{prefix}{name}": value.clone()
@@ -473,9 +473,9 @@ def train_step(
     return sums
 
 
-def _settings(method: Method) -> RenderSettings:
+def learned_rays(num_samples: int) -> RenderSettings:
     """Of rays that are learned from: little is left out of their gradient."""
-    return RenderSettings(num_samples=method.num_samples, smallest_weight=1e-6, stop=1e-5)
+    return RenderSettings(num_samples=num_samples, smallest_weight=1e-6, stop=1e-5)
 
 
 def frame_losses(
@@ -509,7 +509,7 @@ def frame_losses(
         predicted = avatar.occupancy.of_items(state.codes, points, items)
         losses["occupancy"] = occupancy_loss(predicted, labels)
 
-    settings = _settings(method)
+    settings = learned_rays(method.num_samples)
     patches = [
         patch_pixels(frame.mask, method.patch_size, method.patch_strides, generator)
         for _ in range(method.patches)
