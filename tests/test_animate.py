@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import torch
 from conftest import bent_pose, camera_above
 from PIL import Image
+from two_processes import ended, two_begun
 
 from handavatar.animate import (
     PASSES,
@@ -19,11 +21,13 @@ from handavatar.animate import (
     orbited,
     pass_pictures,
     render_motion,
+    rendering_error,
 )
-from handavatar.avatar import CheckpointError, HandAvatar
+from handavatar.avatar import CheckpointError, HandAvatar, Rendering, RenderSettings
 from handavatar.capture.frames import CaptureError
 from handavatar.edit import Edit
 from handavatar.geometry.cameras import project
+from handavatar.hand.pose import HandPose
 
 SIZE = 16
 
@@ -128,9 +132,113 @@ def test_a_failure_on_the_way_leaves_nothing(
     assert not list(tmp_path.iterdir())
 
 
+def test_what_was_rendered_before_the_end_is_kept_and_used(
+    avatar_file: Path, motion_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = _options(avatar_file, motion_file, tmp_path / "out", frames=3)
+    whole = render_motion(replace(options, out=tmp_path / "whole"))
+    rendered: list[HandPose] = []
+    render = HandAvatar.render
+
+    def killed_at_the_third(self: HandAvatar, pose: HandPose, *rest: Any) -> Rendering:
+        if len(rendered) == 2:
+            raise KeyboardInterrupt
+        rendered.append(pose)
+        return render(self, pose, *rest)
+
+    monkeypatch.setattr(HandAvatar, "render", killed_at_the_third)
+    with pytest.raises(KeyboardInterrupt):
+        render_motion(options)
+    assert not options.out.exists()
+    left = tmp_path / "out.unfinished" / "rgb"
+    assert sorted(path.name for path in left.iterdir()) == ["000000.png", "000001.png"]
+    (left / ".tmp-1-000002.png").write_bytes(b"half")
+
+    rendered.clear()
+    assert render_motion(options) == options.out
+    assert len(rendered) == 1, "only the frame that was missing"
+    assert _contents(options.out) == _contents(whole)
+    assert not (tmp_path / "out.unfinished").exists()
+
+
+def test_frames_of_another_work_are_not_used(
+    avatar_file: Path, motion_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = _options(avatar_file, motion_file, tmp_path / "out")
+
+    def disk_full(*_: object) -> None:
+        raise OSError("no space left")
+
+    with monkeypatch.context() as patched:
+        patched.setattr("handavatar.animate.VideoWriter", disk_full)
+        with pytest.raises(OSError, match="no space"):
+            render_motion(options)
+    assert (tmp_path / "out.unfinished" / "rgb" / "000001.png").is_file()
+    bright = replace(options, light_gain=1.5)
+    assert _contents(render_motion(bright)) == _contents(
+        render_motion(replace(bright, out=tmp_path / "fresh"))
+    )
+
+
+def test_two_processes_share_the_frames(
+    avatar_file: Path, motion_file: Path, tmp_path: Path
+) -> None:
+    alone = render_motion(_options(avatar_file, motion_file, tmp_path / "alone", frames=3))
+    words = ["render", str(avatar_file), "--motion", str(motion_file), "--size", str(SIZE)]
+    words += ["--frames", "3", "--num-samples", "16", "--out", str(tmp_path / "shared")]
+    # The second process dies at its first frame; its frames are done by the rerun.
+    dying = [
+        "-c",
+        "import os, sys\n"
+        "from handavatar import cli\n"
+        "from handavatar.avatar import HandAvatar\n"
+        "if os.environ['RANK'] == '1':\n"
+        "    HandAvatar.render = lambda *_: os._exit(9)\n"
+        "sys.exit(cli.main(sys.argv[1:]))\n",
+    ]
+    codes, _ = ended(two_begun(words, dying))
+    assert codes[1] == 9 and codes[0] != 0
+    left = tmp_path / "shared.unfinished" / "rgb"
+    assert sorted(path.name for path in left.iterdir()) == ["000000.png", "000002.png"]
+    codes, text = ended(two_begun(words))
+    assert codes == [0, 0], text
+    assert _contents(tmp_path / "shared") == _contents(alone)
+
+
+def test_the_error_of_every_frame_is_stated_on_request(
+    avatar_file: Path, motion_file: Path, tmp_path: Path
+) -> None:
+    options = replace(_options(avatar_file, motion_file, tmp_path / "near"), check=30)
+    exact = replace(options, out=tmp_path / "exact", quality="exact")
+    near, none = (
+        json.loads((render_motion(chosen) / "errors.json").read_text())
+        for chosen in (options, exact)
+    )
+    assert len(near["frames"]) == 2 and near["frames"][0]["pixels"] == 30
+    assert 0 < near["max_error"] < 0.01 and near["worst_psnr"] > 60
+    assert none["max_error"] == 0
+    assert not (tmp_path / "near" / "errors").exists()
+
+
+def test_a_margin_that_cuts_the_hand_is_found_out(small_avatar: HandAvatar) -> None:
+    """The error is looked for beyond the settings' own margin too."""
+    camera = camera_above(32)
+    settings = RenderSettings(mask_margin=2 / 32)
+    good = rendering_error(small_avatar, bent_pose(1), camera, settings, 1000)
+    # A rim of some pixels, within which the field of a small mesh reaches.
+    cut = rendering_error(small_avatar, bent_pose(1), camera, replace(settings, coarse=32), 1000)
+    assert good["psnr"] > 60 > cut["psnr"]
+
+
+def _contents(folder: Path) -> dict[str, bytes]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"check": -1}, "check"),
         ({"passes": "rgb,depht"}, "depht"),
         ({"passes": ""}, "passes"),
         ({"albedo_shift": "0.1,0"}, "three numbers"),

@@ -7,8 +7,8 @@ from source_tree import imported_modules, modules
 
 # Left: a folder or top module. Right: what it may import besides itself.
 EVERYTHING_BELOW = (
-    "geometry hand capture field render edit avatar plain alignment animate evaluate train "
-    "export view demo doctor"
+    "geometry hand capture field render edit avatar plain processes unfinished alignment animate "
+    "evaluate train export view demo doctor"
 )
 MAY_IMPORT = {
     name: set(allowed.split())
@@ -25,11 +25,13 @@ MAY_IMPORT = {
         # The slow renderer that the fast one is measured against.
         "plain": "geometry field render avatar",
         "evaluate": "geometry hand capture avatar alignment plain",
-        "train": "geometry hand capture field render avatar plain alignment evaluate",
+        "train": "geometry hand capture field render avatar plain alignment evaluate processes",
         "export": "geometry hand capture edit avatar",
         "view": "geometry hand capture edit avatar",
+        "processes": "",
+        "unfinished": "",
         # Motions to pictures: what a viewer may see, and the rasteriser's neighbours.
-        "animate": "geometry hand capture render edit avatar",
+        "animate": "geometry hand capture render edit avatar processes unfinished",
         # The whole road in one call, just under the command line.
         "demo": "geometry hand capture field render edit avatar animate evaluate train",
         "doctor": "hand capture field evaluate train",

@@ -1,11 +1,18 @@
-"""Pictures and video of an avatar in poses and from cameras it never saw."""
+"""Pictures and video of an avatar in poses and from cameras it never saw.
 
+Several processes, also on several machines with a common disk, share the frames:
+``torchrun --nproc-per-node 2 -m handavatar render RUN ...``. What was rendered before a process was
+killed is kept, and the same command given again renders the rest.
+"""
+
+import io
+import json
 import math
-import shutil
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from fractions import Fraction
+from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import av
 import numpy as np
@@ -13,12 +20,20 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from handavatar.avatar import HandAvatar, Rendering, RenderSettings, chosen_device
+from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chosen_device
 from handavatar.capture.motion import MOTIONS, Motion, named_motion, read_motion
 from handavatar.edit import Edit, bones_named
-from handavatar.geometry.cameras import Camera, look_at, project
+from handavatar.geometry.cameras import (
+    Camera,
+    look_at,
+    pixel_centers,
+    project,
+    rays_through_pixels,
+)
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
+from handavatar.processes import joined_processes
+from handavatar.unfinished import UnfinishedFolder
 
 PASSES = ("rgb", "albedo", "illumination", "normal", "depth", "alpha")
 
@@ -37,6 +52,10 @@ class RenderOptions:
         frames: render so many frames, evenly spread; all by default.
         orbit: turn the camera once around the hand while it moves.
         num_samples: samples per ray.
+        quality: ``near-exact`` looks closely only near the hand; ``exact`` leaves out nothing that
+            weighs 1e-7, and takes some three times as long.
+        check: of every frame so many pixels are evaluated exactly as well, and ``errors.json``
+            states how far they are from the picture.
         light_gain: multiplies the illumination.
         albedo_shift: added to the albedo, R,G,B in [-1, 1].
         lift_shadow: fingers or bones that cast no shadow, comma-separated.
@@ -52,6 +71,8 @@ class RenderOptions:
     frames: int | None = None
     orbit: bool = False
     num_samples: int = 64
+    quality: Literal["near-exact", "exact"] = "near-exact"
+    check: int = 0
     light_gain: float = 1.0
     albedo_shift: str = "0,0,0"
     lift_shadow: str = ""
@@ -65,6 +86,8 @@ def render_motion(options: RenderOptions) -> Path:
     Returns:
         The folder.
 
+    Started by ``torchrun``, the processes share the frames; the first one writes the videos.
+
     Raises:
         CheckpointError: if the avatar cannot be read.
         CaptureError: if the motion cannot be read.
@@ -74,6 +97,7 @@ def render_motion(options: RenderOptions) -> Path:
         ("--size", options.size, 2),
         ("--frames", 1 if options.frames is None else options.frames, 1),
         ("--num-samples", options.num_samples, 1),
+        ("--check", options.check, 0),
     ):
         if value < least:
             raise ValueError(f"{flag} {value}: expected at least {least}")
@@ -86,29 +110,138 @@ def render_motion(options: RenderOptions) -> Path:
                 f"--passes: there is no pass '{name}'; choose from {', '.join(PASSES)}"
             )
     edit = edit_from(options.light_gain, options.albedo_shift, options.lift_shadow)
+    chosen_device(options.device)  # What is not there is told before anything is done.
     avatar = HandAvatar.load(options.run)
-    avatar.moved_to(chosen_device(options.device))
     motion = _chosen_motion(avatar, options.motion)
-    steps = _spread(len(motion), options.frames)
-    poses = [motion.pose(step) for step in steps]
+    poses = [motion.pose(step) for step in _spread(len(motion), options.frames)]
     camera = camera_on(avatar, poses, options.size)
-    fps = motion.fps * len(steps) / len(motion)
-    settings = RenderSettings(num_samples=options.num_samples)
-    with _new_folder(options.out, options.overwrite) as folder:
-        writers = {name: VideoWriter(folder / f"{name}.mp4", fps, options.size) for name in passes}
-        for index, pose in enumerate(poses):
-            view = camera
-            if options.orbit:
-                view = orbited(camera, _middle(avatar, poses[0]), 2 * math.pi * index / len(poses))
-            rendering = avatar.render(pose, view, edit, settings)
-            for name, pixels in pass_pictures(rendering, avatar.info.get("side", "right")).items():
-                if name in passes:
-                    (folder / name).mkdir(exist_ok=True)
-                    Image.fromarray(pixels).save(folder / name / f"{index:06d}.png")
-                    writers[name].add(pixels)
-        for writer in writers.values():
-            writer.close()
+    views = [camera] * len(poses)
+    if options.orbit:
+        middle = _middle(avatar, poses[0])
+        turns = [2 * math.pi * index / len(poses) for index in range(len(poses))]
+        views = [orbited(camera, middle, turn) for turn in turns]
+    settings = EXACT if options.quality == "exact" else RenderSettings()
+    settings = replace(settings, num_samples=options.num_samples)
+    folder = UnfinishedFolder(options.out, _what_frames_depend_on(avatar, options, poses, views))
+    with joined_processes(str(chosen_device(options.device))) as processes:
+        avatar.moved_to(processes.device)
+        try:
+            if processes.is_first:
+                folder.begin(options.overwrite)
+            processes.wait()
+            for index in range(processes.rank, len(poses), processes.count):
+                files = [f"{name}/{index:06d}.png" for name in passes]
+                files += [f"errors/{index:06d}.json"] * (options.check > 0)
+                if not folder.has(files):
+                    rendering = avatar.render(poses[index], views[index], edit, settings)
+                    if options.check:
+                        error = rendering_error(
+                            avatar, poses[index], views[index], settings, options.check, index
+                        )
+                        folder.write(f"errors/{index:06d}.json", json.dumps(error).encode())
+                    side = avatar.info.get("side", "right")
+                    for name, pixels in pass_pictures(rendering, side).items():
+                        if name in passes:
+                            folder.write(f"{name}/{index:06d}.png", _png(pixels))
+            processes.wait()
+        except BaseException:
+            if processes.is_first:
+                folder.abandon()
+            raise
+        if processes.is_first:
+            fps = motion.fps * len(poses) / len(motion)
+            _join_frames(folder.path, passes, len(poses), fps, options)
+            folder.finish()
+        processes.wait()
     return options.out
+
+
+def rendering_error(
+    avatar: HandAvatar,
+    pose: HandPose,
+    camera: Camera,
+    settings: RenderSettings,
+    count: int,
+    seed: int = 0,
+) -> dict[str, float]:
+    """How far rays evaluated with these settings are from exact ones, on some pixels.
+
+    Args:
+        avatar: whose fields.
+        pose: of the hand.
+        camera: of the picture.
+        settings: that are judged, one ray a pixel.
+        count: pixels, drawn among those near the hand, of which the picture has as many or fewer.
+        seed: of the draw.
+
+    Returns:
+        ``max_error`` and ``psnr`` (decibels; infinite errors of zero are given as 200) of the
+        colour in [0, 1], and ``pixels``, how many were compared.
+    """
+    with torch.no_grad():
+        state = avatar.prepare(pose.to(avatar.device))
+        camera = camera.to(avatar.device)
+        # Twice the margin, so that what the settings' own margin cuts off is seen.
+        around = avatar.near_mesh(state, camera, min(2 * settings.mask_margin, 0.25))
+        pixels = around.flatten().nonzero()[:, 0]
+        generator = torch.Generator().manual_seed(seed)
+        order = torch.randperm(len(pixels), generator=generator)[:count]
+        pixels = pixels[order.to(pixels.device)]
+        rays = rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1)[pixels])
+        exact = avatar.render_rays(state, rays, replace(EXACT, num_samples=settings.num_samples))
+        found = avatar.render_rays(state, rays, settings)
+        near = avatar.near_mesh(state, camera, settings.mask_margin).flatten()[pixels]
+        error = torch.where(near[:, None], found.color, 0.0) - exact.color
+    squared = float(error.double().square().mean()) if len(pixels) else 0.0
+    return {
+        "max_error": float(error.abs().max()) if len(pixels) else 0.0,
+        "psnr": -10 * math.log10(max(squared, 1e-20)),
+        "pixels": float(len(pixels)),
+    }
+
+
+def _what_frames_depend_on(
+    avatar: HandAvatar, options: RenderOptions, poses: list[HandPose], views: list[Camera]
+) -> dict[str, Any]:
+    """The options but for where and how often, and a fingerprint of avatar, poses and cameras."""
+    elsewhere = ("run", "motion", "out", "frames", "orbit", "overwrite", "device")
+    digest = sha256()
+    tensors = [value for _, value in sorted(avatar.state_dict().items())]
+    tensors += [value for pose in poses for value in (pose.rotations, pose.translation)]
+    for value in tensors:
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    for view in views:
+        digest.update(repr((view.focal, view.center, view.camera_from_world.tolist())).encode())
+    record = {name: value for name, value in asdict(options).items() if name not in elsewhere}
+    return record | {"sha256": digest.hexdigest(), "frame_count": len(poses)}
+
+
+def _join_frames(
+    folder: Path, passes: tuple[str, ...], count: int, fps: float, options: RenderOptions
+) -> None:
+    """Makes the videos, and one file of the frames' errors, from what all processes wrote."""
+    for name in passes:
+        writer = VideoWriter(folder / f"{name}.mp4", fps, options.size)
+        for index in range(count):
+            writer.add(np.asarray(Image.open(folder / name / f"{index:06d}.png")))
+        writer.close()
+    if options.check:
+        files = [folder / "errors" / f"{index:06d}.json" for index in range(count)]
+        frames = [json.loads(path.read_text(encoding="utf-8")) for path in files]
+        worst = max(frame["max_error"] for frame in frames)
+        value = {"max_error": worst, "worst_psnr": min(frame["psnr"] for frame in frames)}
+        (folder / "errors.json").write_text(
+            json.dumps(value | {"frames": frames}, indent=2) + "\n", encoding="utf-8"
+        )
+        for path in files:
+            path.unlink()
+        (folder / "errors").rmdir()
+
+
+def _png(pixels: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, "PNG")
+    return buffer.getvalue()
 
 
 def edit_from(light_gain: float, albedo_shift: str, lift_shadow: str) -> Edit:
@@ -245,26 +378,3 @@ def _middle(avatar: HandAvatar, pose: HandPose) -> Tensor:
     with torch.no_grad():
         vertices = avatar.rig.to("cpu").shaped(avatar.coefficients.cpu()).posed(pose).vertices
     return (vertices.amin(0) + vertices.amax(0)) / 2
-
-
-class _new_folder:
-    """Fills a folder aside and renames it into place, so that nothing is half written."""
-
-    def __init__(self, target: Path, overwrite: bool) -> None:
-        if target.exists() and (not target.is_dir() or any(target.iterdir())) and not overwrite:
-            raise ValueError(f"--out {target}: not empty; name another, or add --overwrite")
-        self._target = target
-        self._aside = target.with_name(target.name + ".unfinished")
-
-    def __enter__(self) -> Path:
-        shutil.rmtree(self._aside, ignore_errors=True)
-        self._aside.mkdir(parents=True)
-        return self._aside
-
-    def __exit__(self, kind: Any, *_: Any) -> None:
-        if kind is not None:
-            shutil.rmtree(self._aside, ignore_errors=True)
-            return
-        if self._target.exists():
-            shutil.rmtree(self._target)
-        self._aside.rename(self._target)

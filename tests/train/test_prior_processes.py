@@ -3,9 +3,6 @@
 import json
 import os
 import signal
-import socket
-import subprocess
-import sys
 from contextlib import nullcontext
 from dataclasses import fields, replace
 from pathlib import Path
@@ -13,18 +10,18 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file
+from two_processes import ended
 
 import handavatar.train.prior as prior
 from handavatar.avatar import CheckpointError
+from handavatar.processes import Processes
 from handavatar.train.labelled_poses import LabelledPose, PoseStream
 from handavatar.train.pretraining import begin_prior_run
 from handavatar.train.prior import PriorOptions, train_prior
-from handavatar.train.processes import Processes
 from handavatar.train.stage_times import StageTimes
 from handavatar.train.stopping import Interrupted
 
 WORDS = ["prior", "train", "--points", "64", "--level", "778", "--rounds", "0", "--poses", "2"]
-PROGRAM = ["-m", "handavatar"]
 STOPPED_PROGRAM = [
     "-c",
     """
@@ -49,50 +46,12 @@ def _options(out: Path, steps: int) -> PriorOptions:
     return PriorOptions(out, steps=steps, points=64, poses=2, level="778", rounds=0)
 
 
-def _begun(program: list[str], words: list[str], **environment: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [sys.executable, *program, *words],
-        stderr=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1", **environment},
-    )
-
-
-def _two_begun(words: list[str], program: list[str] = PROGRAM) -> list[subprocess.Popen[str]]:
-    """What torchrun sets, without its agent, which takes seconds to start."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    return [
-        _begun(
-            program,
-            words,
-            RANK=str(rank),
-            LOCAL_RANK=str(rank),
-            WORLD_SIZE="2",
-            MASTER_ADDR="127.0.0.1",
-            MASTER_PORT=port,
-        )
-        for rank in range(2)
-    ]
-
-
-def _ended(processes: list[subprocess.Popen[str]]) -> tuple[list[int], str]:
-    try:
-        texts = [process.communicate(timeout=60)[1] for process in processes]
-    finally:
-        for process in processes:
-            process.kill()
-    return [process.returncode for process in processes], "\n".join(texts)
-
-
 @pytest.fixture(scope="module")
 def two_processes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What two processes left, undisturbed: the weights ``two`` and the folder ``run``."""
     folder = tmp_path_factory.mktemp("two")
     words = [*WORDS, "--out", str(folder / "two"), "--folder", str(folder / "run")]
-    codes, text = _ended(_two_begun([*words, "--steps", "3"]))
+    codes, text = ended(two_begun([*words, "--steps", "3"]))
     assert codes == [0, 0], text
     return folder
 
@@ -121,12 +80,12 @@ def test_two_processes_stop_together_and_continue_bit_for_bit(
     tmp_path: Path, two_processes: Path
 ) -> None:
     words = [*WORDS, "--out", str(tmp_path / "two"), "--folder", str(tmp_path / "run")]
-    codes, text = _ended(_two_begun([*words, "--steps", "3"], STOPPED_PROGRAM))
+    codes, text = ended(two_begun([*words, "--steps", "3"], STOPPED_PROGRAM))
     assert codes == [130, 130], text
     assert text.count("stopped at step 1; continue with --folder") == 2
     # Two steps more: what the second process keeps of the optimisers shows in the first one's
     # weights only by the gradient of a later step.
-    codes, text = _ended(_two_begun([*words, "--steps", "3"]))
+    codes, text = ended(two_begun([*words, "--steps", "3"]))
     assert codes == [0, 0], text
     assert [line["step"] for line in _log(tmp_path / "run")] == [1, 3]
     # Equal bits: a sum of two gradients has only one order. That of three may be rounded otherwise.

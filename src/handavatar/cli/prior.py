@@ -6,8 +6,8 @@ def train(words: list[str]) -> int:
     import shlex
 
     from handavatar.cli.arguments import parse
+    from handavatar.processes import is_first_process
     from handavatar.train.prior import PriorEvaluationOptions, PriorOptions, train_prior
-    from handavatar.train.processes import is_first_process
     from handavatar.train.progress import Progress
 
     options = parse(PriorOptions, words, "prior train")

@@ -31,6 +31,7 @@ from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
+from handavatar.processes import Processes, joined_processes
 from handavatar.train.labelled_poses import LabelledPose, PoseStream, labelled_pose
 from handavatar.train.pretraining import (
     OccupancyLoss,
@@ -41,7 +42,6 @@ from handavatar.train.pretraining import (
     save_progress,
     set_rate,
 )
-from handavatar.train.processes import Processes, joined_processes
 from handavatar.train.runs import Run, append_log, locked, truncate_log
 from handavatar.train.stage_times import StageTimes
 from handavatar.train.stopping import Interrupted, stop_signals

@@ -1,4 +1,4 @@
-"""Several processes that train one model: started by ``torchrun``, one gradient together."""
+"""Several processes that share one work: started by ``torchrun``, or one alone."""
 
 import os
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ import torch.distributed
 
 @dataclass(frozen=True)
 class Processes:
-    """This process among those that train together.
+    """This process among those that work together.
 
     Attributes:
         rank: of this one, from 0.
