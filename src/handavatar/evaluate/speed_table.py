@@ -5,8 +5,12 @@ same for every ray, so it is timed on some rays of each picture, drawn at random
 """
 
 import math
+import multiprocessing
+import resource
+import sys
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -61,7 +65,7 @@ class SpeedTableOptions:
     @property
     def total_steps(self) -> int:
         """Pictures and the choice of the reference's pieces."""
-        return self.poses + len(self.plain_points) + len(self.sizes)
+        return self.poses + len(self.plain_points) + len(_WAYS) * len(self.sizes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +117,7 @@ def speed_table(
 
     with torch.no_grad():
         scenes = [
-            _scene(avatar, name, number, options)
+            _scene(avatar, name, number, options.size, options.plain_rays)
             for number, name in enumerate(list(GESTURES)[: options.poses])
         ]
         points_at_once = _best_pieces(avatar, scenes[0], options, finished)
@@ -126,9 +130,14 @@ def speed_table(
             name: _row(timing, timings["plain"], counts[name], options)
             for name, timing in timings.items()
         }
-        scaling = []
-        for size in options.sizes:
-            scaling.append(_seconds_of_size(avatar, scenes[0], size))
+    for size in options.sizes:
+        for name in _WAYS:
+            spent, memory = _alone(options.avatar, name, size)
+            rows[f"{name}, {size} pixels"] = {
+                **dict.fromkeys(rows["plain"]),
+                "s a picture": round(spent, 3),
+                "MB at most": round(memory),
+            }
             finished()
     peak = _peak_flops()
     notes = (
@@ -141,17 +150,15 @@ def speed_table(
         f"TFLOP of matrix products and GB through memory, every operation's operands and result, "
         f"of the first pose; this machine reaches {peak / 1e9:,.0f} GFLOP/s in a product of two "
         "2048x2048 matrices.",
-        "Seconds by size of the picture, first pose, exact and near-exact: "
-        + "; ".join(
-            f"{size}: {exact:.2f} and {near:.2f}"
-            for size, (exact, near) in zip(options.sizes, scaling, strict=True)
-        )
-        + ".",
+        "By size of the picture: the first pose in a process of its own; MB: the most that the "
+        "process held, of which it holds some 300 before there is a hand.",
     )
     for row in rows.values():
-        tera, seconds = row["TFLOP"], row["s of the first pose"]
-        assert isinstance(tera, float) and isinstance(seconds, float)
-        row["% of peak"] = round(100 * tera * 1e12 / seconds / peak, 1)
+        work, seconds = row["TFLOP"], row.pop("s of the first pose")
+        share = None
+        if isinstance(work, float) and isinstance(seconds, float):
+            share = round(100 * work * 1e12 / seconds / peak, 1)
+        row["% of peak"] = share
     return ResultTable("Speed of rendering", rows, notes)
 
 
@@ -176,12 +183,12 @@ def framing_camera(
     return Camera((focal, focal), (size / 2, size / 2), size, size, pose)
 
 
-def _scene(avatar: HandAvatar, gesture: str, number: int, options: SpeedTableOptions) -> Scene:
+def _scene(avatar: HandAvatar, gesture: str, number: int, size: int, num_rays: int) -> Scene:
     pose = HandPose(gesture_rotations(avatar.base_rig, gesture), torch.zeros(3))
     state = avatar.prepare(pose)
-    camera = framing_camera(state.posed.vertices, _VIEWS[number % len(_VIEWS)], options.size)
+    camera = framing_camera(state.posed.vertices, _VIEWS[number % len(_VIEWS)], size)
     generator = torch.Generator().manual_seed(number)
-    pixels = torch.randperm(options.size**2, generator=generator)[: options.plain_rays]
+    pixels = torch.randperm(size**2, generator=generator)[:num_rays]
     rays = rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1)[pixels])
     return Scene(pose, camera, state, pixels, rays)
 
@@ -291,14 +298,25 @@ def _stages(avatar: HandAvatar) -> Iterator[dict[str, float]]:
             handle.remove()
 
 
-def _seconds_of_size(avatar: HandAvatar, scene: Scene, size: int) -> tuple[float, float]:
-    """Of the exact and of the near-exact way."""
-    camera, spent = scene.camera.resized(size, size), []
-    for settings in _WAYS.values():
-        begin = time.perf_counter()
-        avatar.render(scene.pose, camera, settings=settings)
-        spent.append(time.perf_counter() - begin)
-    return spent[0], spent[1]
+def _alone(path: Path, way: str, size: int) -> tuple[float, float]:
+    """Seconds of one picture, and the most memory (megabytes) that a process of its own held."""
+    # Spawned, not forked: a fork would start with this process's memory.
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context) as pool:
+        return pool.submit(_rendered_alone, path, way, size, torch.get_num_threads()).result()
+
+
+def _rendered_alone(path: Path, way: str, size: int, threads: int) -> tuple[float, float]:
+    torch.set_num_threads(threads)
+    avatar = HandAvatar.load(path)
+    with torch.no_grad():
+        scene = _scene(avatar, next(iter(GESTURES)), 0, size, 1)
+    begin = time.perf_counter()
+    avatar.render(scene.pose, scene.camera, settings=_WAYS[way])
+    seconds = time.perf_counter() - begin
+    # Kilobytes, but bytes on a Mac.
+    unit = 1e6 if sys.platform == "darwin" else 1e3
+    return seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
 # --- counting -------------------------------------------------------------------------------------
@@ -388,5 +406,6 @@ def _row(
     }
     row["TFLOP"] = round(counts[0] / 1e12, 4)
     row["GB"] = round(counts[1] / 1e9, 2)
-    row["s of the first pose"] = round(timing.seconds[0], 3)
+    row["MB at most"] = None
+    row["s of the first pose"] = timing.seconds[0]
     return row
