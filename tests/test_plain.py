@@ -84,6 +84,25 @@ def test_random_fields_are_rendered_alike_too(small_avatar: HandAvatar, is_orien
     _assert_alike(avatar, bent_pose(2), camera_above(6))
 
 
+@pytest.mark.parametrize("bound", [1e-3, 1e-2, 5e-2])
+def test_what_is_skipped_costs_no_more_than_it_weighs(
+    small_avatar: HandAvatar, bound: float
+) -> None:
+    """Colours lie in [0, 1]: a ray is off by at most the weight that it lacks."""
+    camera, pose = camera_above(12), bent_pose(2)
+    settings = replace(EVERYTHING, smallest_weight=bound, stop=bound)
+    with torch.no_grad():
+        state = small_avatar.prepare(pose)
+        found = small_avatar.render_rays(state, _rays(camera), settings)
+        whole = plain_rays(small_avatar, state, _rays(camera), 24)
+    lacking = whole.alpha - found.alpha
+    assert float(lacking.min()) > -5e-5 and float(lacking.max()) < 24 * bound + bound
+    assert float(lacking.max()) > 0.1 * bound, "something is skipped"
+    for name in ("color", "albedo", "illumination"):
+        error = (getattr(found, name) - getattr(whole, name)).abs().view(144, -1).amax(1)
+        assert bool((error <= lacking.clamp_min(0) + 5e-5).all()), name
+
+
 def test_the_size_of_the_pieces_does_not_matter(small_avatar: HandAvatar) -> None:
     rays = _rays(camera_above(6))
     with torch.no_grad():

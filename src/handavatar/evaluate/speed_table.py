@@ -130,9 +130,10 @@ def speed_table(
             name: _row(timing, timings["plain"], counts[name], options)
             for name, timing in timings.items()
         }
+    empty = 0.0
     for size in options.sizes:
         for name in _WAYS:
-            spent, memory = _alone(options.avatar, name, size)
+            spent, empty, memory = _alone(options.avatar, name, size)
             rows[f"{name}, {size} pixels"] = {
                 **dict.fromkeys(rows["plain"]),
                 "s a picture": round(spent, 3),
@@ -151,7 +152,7 @@ def speed_table(
         f"of the first pose; this machine reaches {peak / 1e9:,.0f} GFLOP/s in a product of two "
         "2048x2048 matrices.",
         "By size of the picture: the first pose in a process of its own; MB: the most that the "
-        "process held, of which it holds some 300 before there is a hand.",
+        f"process held, of which {empty:.0f} before the picture was begun.",
     )
     for row in rows.values():
         work, seconds = row["TFLOP"], row.pop("s of the first pose")
@@ -298,25 +299,30 @@ def _stages(avatar: HandAvatar) -> Iterator[dict[str, float]]:
             handle.remove()
 
 
-def _alone(path: Path, way: str, size: int) -> tuple[float, float]:
-    """Seconds of one picture, and the most memory (megabytes) that a process of its own held."""
+def _alone(path: Path, way: str, size: int) -> tuple[float, float, float]:
+    """One picture in a process of its own: seconds, and the most memory before and with it, MB."""
     # Spawned, not forked: a fork would start with this process's memory.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
         return pool.submit(_rendered_alone, path, way, size, torch.get_num_threads()).result()
 
 
-def _rendered_alone(path: Path, way: str, size: int, threads: int) -> tuple[float, float]:
+def _rendered_alone(path: Path, way: str, size: int, threads: int) -> tuple[float, float, float]:
     torch.set_num_threads(threads)
     avatar = HandAvatar.load(path)
     with torch.no_grad():
         scene = _scene(avatar, next(iter(GESTURES)), 0, size, 1)
+    before = _most_memory()
     begin = time.perf_counter()
     avatar.render(scene.pose, scene.camera, settings=_WAYS[way])
-    seconds = time.perf_counter() - begin
-    # Kilobytes, but bytes on a Mac.
+    return time.perf_counter() - begin, before, _most_memory()
+
+
+def _most_memory() -> float:
+    """The most that this process has held so far, megabytes."""
+    # Told in kilobytes, but in bytes on a Mac.
     unit = 1e6 if sys.platform == "darwin" else 1e3
-    return seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
 # --- counting -------------------------------------------------------------------------------------
