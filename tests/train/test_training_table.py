@@ -15,20 +15,23 @@ def test_training_is_cheaper_and_has_the_same_gradient(
     small_avatar: HandAvatar, tmp_path: Path
 ) -> None:
     small_avatar.save(tmp_path / "avatar.safetensors")
+    sharp = HandAvatar.load(tmp_path / "avatar.safetensors")
+    sharp.occupancy.sharpness = 3.0  # As it is trained.
+    sharp.save(tmp_path / "avatar.safetensors")
     options = TrainingTableOptions(
-        tmp_path / "avatar.safetensors", patch=6, plain_rays=6, steps=1, points=128
+        tmp_path / "avatar.safetensors", patch=8, plain_rays=32, steps=1, points=128
     )
     told: list[int] = []
     table = training_table(options, told.append)
     exact, trained = list(table.rows.values())[1:3]
-    for row, most in ((exact, 1e-3), (trained, 1e-2)):  # Of six rays: more of them err less.
+    for row, most in ((exact, 1e-3), (trained, 0.1)):
         assert isinstance(row["gradient error"], float) and row["gradient error"] < most
         assert isinstance(row["MB ratio"], float) and row["MB ratio"] > 10
     assert set(table.rows) >= {"patch, plain", "pre-training step, plain", "pre-training step"}
     assert told[-1] == options.total_steps
     assert json.loads(json.dumps(table.record(), allow_nan=False)) is not None
     with pytest.raises(ValueError, match="at most as many rays"):
-        training_table(replace(options, plain_rays=37))
+        training_table(replace(options, plain_rays=65))
 
 
 def test_gradients_are_compared_tensor_by_tensor() -> None:

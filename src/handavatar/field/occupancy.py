@@ -9,6 +9,7 @@ pair at every point and is obvious; :meth:`PairOccupancy.forward` decodes only p
 hold the point, shares first layers between pairs, and is fast.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
 
@@ -248,7 +249,7 @@ class PairOccupancy(nn.Module):
 
     def encode(self, parts: Parts, posed: PosedHand) -> HandCodes:
         """Encodes the surface of a posed hand; once per pose."""
-        return hand_codes(self.encoder, parts, posed, self.margin)
+        return hand_codes(self.encoder.factorised, parts, posed, self.margin)
 
     def forward(self, codes: HandCodes, points: Float[Tensor, "points 3"]) -> Occupancy:
         """Occupancy at world points (metres), without gradient; the fast way."""
@@ -415,11 +416,13 @@ class PairOccupancy(nn.Module):
         return self.decoder.pointnet.blocks[0](features), row_of
 
 
-def hand_codes(encoder: PointNet, parts: Parts, posed: PosedHand, margin: float) -> HandCodes:
+def hand_codes(
+    encoded: Callable[[Tensor], Tensor], parts: Parts, posed: PosedHand, margin: float
+) -> HandCodes:
     """Encodes the surface of every part of a posed hand, and bounds it by a box.
 
     Args:
-        encoder: of clouds of 256 points with normals; lengths times ``LENGTH_SCALE``.
+        encoded: of clouds of 256 points with normals, lengths times ``LENGTH_SCALE``: a code each.
         parts: which points.
         posed: the hand.
         margin: how far a part's box reaches beyond the part, metres.
@@ -428,7 +431,7 @@ def hand_codes(encoder: PointNet, parts: Parts, posed: PosedHand, margin: float)
     """
     clouds = parts.point_clouds(posed)
     scaled = torch.cat([clouds[..., :3] * LENGTH_SCALE, clouds[..., 3:]], dim=-1)
-    return HandCodes(encoder.factorised(scaled), parts.boxes(posed, margin))
+    return HandCodes(encoded(scaled), parts.boxes(posed, margin))
 
 
 def local_points(

@@ -72,7 +72,7 @@ class PartwiseOccupancy(nn.Module):
 
     def encode(self, parts: Parts, posed: PosedHand) -> HandCodes:
         """Encodes the surface of a posed hand; once per pose."""
-        return hand_codes(self.encoder, parts, posed, self.margin)
+        return hand_codes(self.encoder.factorised, parts, posed, self.margin)
 
     def forward(self, codes: HandCodes, points: Float[Tensor, "points 3"]) -> PartOccupancy:
         """Occupancy at world points (metres), without gradient, piece by piece."""

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from handavatar.avatar import EXACT, HandAvatar, HandState, RayValues, RenderSettings
 from handavatar.evaluate.speed_table import framing_camera
 from handavatar.evaluate.tables import Cell, ResultTable
-from handavatar.field.occupancy import PairOccupancy
+from handavatar.field.occupancy import PairOccupancy, hand_codes
 from handavatar.geometry.cameras import Rays, pixel_centers, rays_through_pixels
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
@@ -239,7 +239,7 @@ class _PlainLoss(nn.Module):
     def forward(self, samples: list[LabelledPose]) -> Tensor:
         losses = []
         for sample in samples:
-            codes = self.field.encode(self.parts, sample.posed)
+            codes = hand_codes(self.field.encoder, self.parts, sample.posed, self.field.margin)
             predicted, _ = self.field.plain(codes, sample.points)
             target = sample.is_inside.to(predicted)
             losses.append(nn.functional.binary_cross_entropy(predicted, target))
