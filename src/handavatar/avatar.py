@@ -81,9 +81,9 @@ class RenderSettings:
         stop: a ray ends where less than this share of light is left; the error is at most that.
         coarse: every so many samples are evaluated first, the others only near the hand; 1
             evaluates all.
-        refine_above: an interval is near the hand if the occupancy at one of its ends is larger.
-            Validated, not proven: a part thinner than an interval and farther than some
-            millimetres from both its ends is missed.
+        refine_above: an interval is near the hand if the occupancy at one of its ends is larger;
+            that of sharpness 1, whose tail reaches some millimetres. Validated, not proven: a part
+            thinner than an interval and farther than that from both its ends is missed.
         group: coarse samples evaluated at a time along the ray before it may end.
         mask_margin: only pixels within this share of the picture's width of the posed mesh are
             looked at; 6 pixels of 256. The occupancy of a trained field ends some millimetres
@@ -426,7 +426,8 @@ class HandAvatar(nn.Module):
             alive = alive[light[alive] > settings.stop]
         if settings.coarse > 1:
             at_coarse = occupancy[:, coarse]
-            is_near = at_coarse > settings.refine_above
+            # Far outside, the sigmoid of three times a logit is the third power of the sigmoid.
+            is_near = at_coarse > settings.refine_above**self.occupancy.sharpness
             is_lit = (1 - at_coarse).cumprod(1) > settings.stop
             ray, interval = ((is_near[:, :-1] | is_near[:, 1:]) & is_lit[:, :-1]).nonzero().T
             between = coarse[interval][:, None] + torch.arange(1, settings.coarse).to(coarse)
