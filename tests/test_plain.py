@@ -8,7 +8,8 @@ import torch
 from conftest import bent_pose, camera_above
 from torch import Tensor
 
-from handavatar.avatar import HandAvatar, RayValues, RenderSettings
+from handavatar.avatar import EXACT, HandAvatar, RayValues, RenderSettings
+from handavatar.evaluate.speed_table import framing_camera
 from handavatar.field.shading import OrientedCues
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.hand.pose import HandPose
@@ -123,6 +124,25 @@ def test_the_default_settings_lose_less_than_can_be_seen(small_avatar: HandAvata
         seen = getattr(found, name).flatten(0, 1).view(144, -1)
         error = seen - getattr(expected, name).view(144, -1)
         assert -10 * math.log10(float(error.square().mean()) + 1e-12) > 70, name
+
+
+@pytest.mark.parametrize("sharpness", [1.0, 3.0])
+def test_what_is_thin_is_found_between_coarse_samples(
+    small_avatar: HandAvatar, monkeypatch: pytest.MonkeyPatch, sharpness: float
+) -> None:
+    """The sharper the field, the shorter the tail that a coarse sample can see."""
+    monkeypatch.setattr(small_avatar.occupancy, "sharpness", sharpness)
+    # From the side, where fingers lie one behind the other, a ray is long and its samples sparse.
+    for gesture in ("relaxed", "point"):
+        pose = _gesture(small_avatar, gesture)
+        with torch.no_grad():
+            vertices = small_avatar.prepare(pose).posed.vertices
+        camera = framing_camera(vertices, (0.3, 0.2, 1.0), 48)
+        exact, found = (
+            small_avatar.render(pose, camera, settings=replace(settings, edge_rays=1))
+            for settings in (EXACT, RenderSettings())
+        )
+        assert float((exact.color - found.color).abs().max()) < 0.01, gesture
 
 
 def _scalar(values: RayValues) -> Tensor:
