@@ -23,7 +23,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from handavatar.avatar import EXACT, HandAvatar, HandState, RayValues, RenderSettings
-from handavatar.evaluate.tables import Cell, ResultTable
+from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.geometry.cameras import Camera, Rays, look_at, pixel_centers, rays_through_pixels
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import GESTURES, gesture_rotations
@@ -107,14 +107,7 @@ def speed_table(
             f"--plain-rays: found {options.plain_rays}, expected 1 to {options.size**2}"
         )
     avatar = HandAvatar.load(options.avatar)
-    done = 0
-
-    def finished() -> None:
-        nonlocal done
-        done += 1
-        if report is not None:
-            report(done)
-
+    finished = step_counter(report)
     with torch.no_grad():
         scenes = [
             _scene(avatar, name, number, options.size, options.plain_rays)

@@ -1,6 +1,6 @@
 """A table of results: numbers for programs, Markdown for people."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 
 Cell = float | int | str | None
@@ -33,6 +33,19 @@ class ResultTable:
             lines.append(f"| {name} | " + " | ".join(_text(row[c]) for c in columns) + " |")
         notes = "".join(f"\n{note}\n" for note in self.notes)
         return f"### {self.title}\n\n" + "\n".join(lines) + "\n" + notes
+
+
+def step_counter(report: Callable[[int], None] | None) -> Callable[[], None]:
+    """A function that tells ``report`` how often it has been called; silent without one."""
+    done = 0
+
+    def finished() -> None:
+        nonlocal done
+        done += 1
+        if report is not None:
+            report(done)
+
+    return finished
 
 
 def _text(cell: Cell) -> str:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from handavatar.avatar import EXACT, HandAvatar, HandState, RayValues, RenderSettings
 from handavatar.evaluate.speed_table import framing_camera
-from handavatar.evaluate.tables import Cell, ResultTable
+from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.field.occupancy import PairOccupancy, hand_codes
 from handavatar.geometry.cameras import Rays, pixel_centers, rays_through_pixels
 from handavatar.hand.open_hand import load_open_hand
@@ -93,14 +93,7 @@ def training_table(
             f"training table: found a patch of {options.patch} pixels and {options.plain_rays} "
             f"plain rays, expected 1 to {_PICTURE} pixels and at most as many rays as it has"
         )
-    done = 0
-
-    def finished() -> None:
-        nonlocal done
-        done += 1
-        if report is not None:
-            report(done)
-
+    finished = step_counter(report)
     rows = _patch_rows(options, finished)
     plain, ours = _step_seconds(options, finished)
     rows["pre-training step, plain"] = {"s": round(plain, 3), "ratio": 1.0, **_NOTHING}
