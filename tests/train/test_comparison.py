@@ -221,6 +221,7 @@ def test_a_good_prior_has_all_columns() -> None:
     with torch.no_grad():
         codes = field.encode(divide_into_parts(rig), posed)
         found = MeshMeasure(32)(field, codes, posed)
-    assert set(found) == {"lap", "cham_from_truth", "cham", "seam", "seam_step"}
+    columns = {"lap", "cham_to_truth", "cham_from_truth", "cham", "seam", "seam_step"}
+    assert set(found) == columns
     assert all(math.isfinite(value) for value in found.values())
     assert 0 < found["cham"] < 30  # 1e-4 m; a voxel has some 60.

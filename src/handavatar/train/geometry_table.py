@@ -22,7 +22,7 @@ from handavatar.train.labelled_poses import sample_points
 from handavatar.train.prior import EVALUATION_SEED
 from handavatar.train.prior_measures import measure_field
 
-_MESH_COLUMNS = ("lap", "cham_from_truth", "cham", "seam", "seam_step")
+_MESH_COLUMNS = ("lap", "cham_to_truth", "cham_from_truth", "cham", "seam", "seam_step")
 
 
 @dataclass(frozen=True)
