@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file
-from two_processes import ended
+from two_processes import ended, two_begun
 
 import handavatar.train.prior as prior
 from handavatar.avatar import CheckpointError
