@@ -26,6 +26,9 @@ def render(words: list[str]) -> int:
     """Pictures and video of any pose from any camera."""
     from handavatar.animate import RenderOptions, render_motion
     from handavatar.cli.arguments import parse
+    from handavatar.processes import is_first_process
 
-    print(render_motion(parse(RenderOptions, words, "render", positional=("run",))))
+    folder = render_motion(parse(RenderOptions, words, "render", positional=("run",)))
+    if is_first_process():
+        print(folder)
     return 0
