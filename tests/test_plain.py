@@ -9,7 +9,7 @@ from conftest import bent_pose, camera_above
 from torch import Tensor
 
 from handavatar.avatar import EXACT, HandAvatar, RayValues, RenderSettings
-from handavatar.evaluate.speed_table import framing_camera
+from handavatar.evaluate.speed_table import hand_camera
 from handavatar.field.shading import OrientedCues
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.hand.pose import HandPose
@@ -137,7 +137,7 @@ def test_what_is_thin_is_found_between_coarse_samples(
         pose = _gesture(small_avatar, gesture)
         with torch.no_grad():
             vertices = small_avatar.prepare(pose).posed.vertices
-        camera = framing_camera(vertices, (0.3, 0.2, 1.0), 48)
+        camera = hand_camera(vertices, (0.3, 0.2, 1.0), 48)
         exact, found = (
             small_avatar.render(pose, camera, settings=replace(settings, edge_rays=1))
             for settings in (EXACT, RenderSettings())

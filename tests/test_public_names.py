@@ -10,7 +10,9 @@ import pytest
 from source_tree import find_definition, modules
 
 EXACTLY = {
-    "geometry.cameras": "Camera Rays look_at pixel_centers project rays_through_pixels",
+    "geometry.cameras": (
+        "Camera Rays framing_camera look_at pixel_centers project rays_through_pixels"
+    ),
     "geometry.rotations": (
         "apply_rigid axis_angle_from_matrix invert_rigid left_jacobian matrix_from_axis_angle "
         "quaternion_from_matrix rigid_transform skew"
@@ -32,7 +34,7 @@ EXACTLY = {
         "CheckpointError EXACT HandAvatar HandState RayValues RenderSettings Rendering "
         "SCHEMA START_LIGHT VisibleSamples chosen_device"
     ),
-    "plain": "NUM_NEIGHBOURS plain_rays",
+    "plain": "plain_rays",
     "capture.default": "default_capture",
 }
 AT_LEAST = {

@@ -23,13 +23,7 @@ from torch import Tensor
 from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chosen_device
 from handavatar.capture.motion import MOTIONS, Motion, named_motion, read_motion
 from handavatar.edit import Edit, bones_named
-from handavatar.geometry.cameras import (
-    Camera,
-    look_at,
-    pixel_centers,
-    project,
-    rays_through_pixels,
-)
+from handavatar.geometry.cameras import Camera, look_at, project
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
 from handavatar.processes import joined_processes
@@ -110,7 +104,7 @@ def render_motion(options: RenderOptions) -> Path:
                 f"--passes: there is no pass '{name}'; choose from {', '.join(PASSES)}"
             )
     edit = edit_from(options.light_gain, options.albedo_shift, options.lift_shadow)
-    chosen_device(options.device)  # What is not there is told before anything is done.
+    device = str(chosen_device(options.device))
     avatar = HandAvatar.load(options.run)
     motion = _chosen_motion(avatar, options.motion)
     poses = [motion.pose(step) for step in _spread(len(motion), options.frames)]
@@ -123,7 +117,7 @@ def render_motion(options: RenderOptions) -> Path:
     settings = EXACT if options.quality == "exact" else RenderSettings()
     settings = replace(settings, num_samples=options.num_samples)
     folder = UnfinishedFolder(options.out, _what_frames_depend_on(avatar, options, poses, views))
-    with joined_processes(str(chosen_device(options.device))) as processes:
+    with joined_processes(device) as processes:
         avatar.moved_to(processes.device)
         try:
             if processes.is_first:
@@ -132,17 +126,16 @@ def render_motion(options: RenderOptions) -> Path:
             for index in range(processes.rank, len(poses), processes.count):
                 files = [f"{name}/{index:06d}.png" for name in passes]
                 files += [f"errors/{index:06d}.json"] * (options.check > 0)
-                if not folder.has(files):
-                    rendering = avatar.render(poses[index], views[index], edit, settings)
-                    if options.check:
-                        error = rendering_error(
-                            avatar, poses[index], views[index], settings, options.check, index
-                        )
-                        folder.write(f"errors/{index:06d}.json", json.dumps(error).encode())
-                    side = avatar.info.get("side", "right")
-                    for name, pixels in pass_pictures(rendering, side).items():
-                        if name in passes:
-                            folder.write(f"{name}/{index:06d}.png", _png(pixels))
+                if folder.has(files):
+                    continue
+                pose, view = poses[index], views[index]
+                rendering = avatar.render(pose, view, edit, settings)
+                pictures = pass_pictures(rendering, avatar.info.get("side", "right"))
+                for name in passes:
+                    folder.write(f"{name}/{index:06d}.png", _png(pictures[name]))
+                if options.check:
+                    error = rendering_error(avatar, pose, view, settings, options.check, index)
+                    folder.write(f"errors/{index:06d}.json", json.dumps(error).encode())
             processes.wait()
         except BaseException:
             if processes.is_first:
@@ -175,7 +168,7 @@ def rendering_error(
         seed: of the draw.
 
     Returns:
-        ``max_error`` and ``psnr`` (decibels; infinite errors of zero are given as 200) of the
+        ``max_error`` and ``psnr`` (decibels; 200 where there is no error) of the
         colour in [0, 1], and ``pixels``, how many were compared.
     """
     with torch.no_grad():
@@ -187,11 +180,9 @@ def rendering_error(
         generator = torch.Generator().manual_seed(seed)
         order = torch.randperm(len(pixels), generator=generator)[:count]
         pixels = pixels[order.to(pixels.device)]
-        rays = rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1)[pixels])
-        exact = avatar.render_rays(state, rays, replace(EXACT, num_samples=settings.num_samples))
-        found = avatar.render_rays(state, rays, settings)
-        near = avatar.near_mesh(state, camera, settings.mask_margin).flatten()[pixels]
-        error = torch.where(near[:, None], found.color, 0.0) - exact.color
+        exact = replace(EXACT, num_samples=settings.num_samples)
+        found, truth = (avatar.at_pixels(state, camera, pixels, way) for way in (settings, exact))
+        error = found.color - truth.color
     squared = float(error.double().square().mean()) if len(pixels) else 0.0
     return {
         "max_error": float(error.abs().max()) if len(pixels) else 0.0,

@@ -482,6 +482,31 @@ class HandAvatar(nn.Module):
         channels = {name: values.unflatten(0, size) for name, values in flat.items()}
         return Rendering(**channels)
 
+    def at_pixels(
+        self,
+        state: HandState,
+        camera: Camera,
+        pixels: Int[Tensor, "pixels"],
+        settings: RenderSettings,
+    ) -> RayValues:
+        """What :meth:`render` shows at some pixels, one ray each.
+
+        Args:
+            state: of the pose.
+            camera: of the picture.
+            pixels: their numbers, row by row.
+            settings: samples and bounds; ``edge_rays`` plays no part.
+        """
+        is_seen = self.near_mesh(state, camera, settings.mask_margin).flatten()[pixels]
+        rays = rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1)[pixels])
+        values = vars(self.render_rays(state, rays, settings))
+        return RayValues(
+            **{
+                name: torch.where(is_seen.view(-1, *(1,) * (value.ndim - 1)), value, 0.0)
+                for name, value in values.items()
+            }
+        )
+
     def _along(
         self,
         state: HandState,

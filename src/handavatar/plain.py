@@ -8,12 +8,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar, HandState, RayValues
-from handavatar.field.anchors import Neighbours, inverse_distance_weights
+from handavatar.field.anchors import NUM_NEIGHBOURS, Neighbours, inverse_distance_weights
 from handavatar.geometry.cameras import Rays
 from handavatar.render.sampling import depths_along, intervals_through_boxes
 from handavatar.render.volume import composite, visibility
-
-NUM_NEIGHBOURS = 4
 
 
 def plain_rays(

@@ -11,7 +11,7 @@ from handavatar.avatar import HandAvatar
 from handavatar.evaluate.speed_table import (
     SpeedTableOptions,
     counted,
-    framing_camera,
+    hand_camera,
     speed_table,
 )
 from handavatar.geometry.cameras import project
@@ -56,7 +56,7 @@ def test_the_camera_holds_the_whole_hand(small_avatar: HandAvatar) -> None:
     with torch.no_grad():
         vertices = small_avatar.prepare(bent_pose(3)).posed.vertices
     for direction in ((0.0, 1.0, 0.0), (0.3, -0.5, 0.6)):
-        pixels, depth = project(framing_camera(vertices, direction, 64), vertices)
+        pixels, depth = project(hand_camera(vertices, direction, 64), vertices)
         assert float(depth.min()) > 0
         assert float(pixels.min()) >= 0 and float(pixels.max()) <= 64
         assert float((pixels.amax(0) - pixels.amin(0)).max()) > 0.5 * 64

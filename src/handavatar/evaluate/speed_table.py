@@ -17,14 +17,20 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
 from handavatar.avatar import EXACT, HandAvatar, HandState, RayValues, RenderSettings
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
-from handavatar.geometry.cameras import Camera, Rays, look_at, pixel_centers, rays_through_pixels
+from handavatar.geometry.cameras import (
+    Camera,
+    Rays,
+    framing_camera,
+    pixel_centers,
+    rays_through_pixels,
+)
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import GESTURES, gesture_rotations
 from handavatar.plain import plain_rays
@@ -119,8 +125,9 @@ def speed_table(
             _time_scene(avatar, scene, points_at_once, timings)
             finished()
         counts = _counts(avatar, scenes[0], points_at_once)
+        peak = _peak_flops()
         rows = {
-            name: _row(timing, timings["plain"], counts[name], options)
+            name: _row(timing, timings["plain"], counts[name], peak)
             for name, timing in timings.items()
         }
     empty = 0.0
@@ -133,7 +140,6 @@ def speed_table(
                 "MB at most": round(memory),
             }
             finished()
-    peak = _peak_flops()
     notes = (
         f"{len(scenes)} poses of {options.size}x{options.size} pixels, {torch.get_num_threads()} "
         f"threads; the plain reference on {options.plain_rays} rays of each, scaled to all, "
@@ -147,44 +153,31 @@ def speed_table(
         "By size of the picture: the first pose in a process of its own; MB: the most that the "
         f"process held, of which {empty:.0f} before the picture was begun.",
     )
-    for row in rows.values():
-        work, seconds = row["TFLOP"], row.pop("s of the first pose")
-        share = None
-        if isinstance(work, float) and isinstance(seconds, float):
-            share = round(100 * work * 1e12 / seconds / peak, 1)
-        row["% of peak"] = share
     return ResultTable("Speed of rendering", rows, notes)
 
 
 # --- scenes ---------------------------------------------------------------------------------------
 
 
-def framing_camera(
-    vertices: torch.Tensor, direction: tuple[float, float, float], size: int
+def hand_camera(
+    vertices: Float[Tensor, "vertices 3"], direction: tuple[float, float, float], size: int
 ) -> Camera:
-    """A camera that sees all vertices with some room around them.
-
-    Args:
-        vertices: world, metres.
-        direction: from the hand's middle to the camera.
-        size: pixels along a side.
-    """
-    lower, upper = vertices.amin(0), vertices.amax(0)
-    middle, reach = (lower + upper) / 2, float((upper - lower).max())
-    towards = nn.functional.normalize(torch.tensor(direction), dim=0)
-    focal = size * (_DISTANCE - reach / 2) / (_ROOM * reach)
-    pose = look_at(middle + _DISTANCE * towards, middle, torch.tensor([-1.0, 0.0, 0.0]))
-    return Camera((focal, focal), (size / 2, size / 2), size, size, pose)
+    """The hand in the middle of a picture, with some room around it."""
+    return framing_camera(vertices, direction, size, _DISTANCE, _ROOM)
 
 
 def _scene(avatar: HandAvatar, gesture: str, number: int, size: int, num_rays: int) -> Scene:
     pose = HandPose(gesture_rotations(avatar.base_rig, gesture), torch.zeros(3))
     state = avatar.prepare(pose)
-    camera = framing_camera(state.posed.vertices, _VIEWS[number % len(_VIEWS)], size)
+    camera = hand_camera(state.posed.vertices, _VIEWS[number % len(_VIEWS)], size)
     generator = torch.Generator().manual_seed(number)
     pixels = torch.randperm(size**2, generator=generator)[:num_rays]
     rays = rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1)[pixels])
     return Scene(pose, camera, state, pixels, rays)
+
+
+def _first_rays(scene: Scene) -> Rays:
+    return Rays(scene.rays.origins[:_COUNTED_RAYS], scene.rays.directions[:_COUNTED_RAYS])
 
 
 # --- timing ---------------------------------------------------------------------------------------
@@ -216,7 +209,7 @@ def _best_pieces(
     avatar: HandAvatar, scene: Scene, options: SpeedTableOptions, finished: Callable[[], None]
 ) -> int:
     """The number of points at a time with which the plain reference is quickest."""
-    few = Rays(scene.rays.origins[:_COUNTED_RAYS], scene.rays.directions[:_COUNTED_RAYS])
+    few = _first_rays(scene)
     spent = {}
     for count in options.plain_points:
         begin = time.perf_counter()
@@ -242,20 +235,8 @@ def _time_scene(
             begin = time.perf_counter()
             avatar.render(scene.pose, scene.camera, settings=settings)
             seconds = time.perf_counter() - begin
-        timings[name].add(seconds, _at_pixels(avatar, scene, settings), truth, dict(stages))
-
-
-def _at_pixels(avatar: HandAvatar, scene: Scene, settings: RenderSettings) -> RayValues:
-    """The chosen pixels as ``render`` would show them, at exactly the reference's places."""
-    near = avatar.near_mesh(scene.state, scene.camera, settings.mask_margin).flatten()
-    values = avatar.render_rays(scene.state, scene.rays, settings)
-    is_seen = near[scene.pixels]
-    return RayValues(
-        **{
-            name: torch.where(is_seen.view(-1, *(1,) * (value.ndim - 1)), value, 0.0)
-            for name, value in vars(values).items()
-        }
-    )
+        found = avatar.at_pixels(scene.state, scene.camera, scene.pixels, settings)
+        timings[name].add(seconds, found, truth, dict(stages))
 
 
 @contextmanager
@@ -345,7 +326,7 @@ def _counts(
     avatar: HandAvatar, scene: Scene, points_at_once: int
 ) -> dict[str, tuple[float, float]]:
     """Floating-point operations and bytes of the first pose's picture, by way."""
-    few = Rays(scene.rays.origins[:_COUNTED_RAYS], scene.rays.directions[:_COUNTED_RAYS])
+    few = _first_rays(scene)
     scale = scene.camera.width * scene.camera.height / len(few.origins)
 
     def plain() -> None:
@@ -388,13 +369,13 @@ def _peak_flops(size: int = 2048, tries: int = 3) -> float:
 
 
 def _row(
-    timing: Timings, plain: Timings, counts: tuple[float, float], options: SpeedTableOptions
+    timing: Timings, plain: Timings, counts: tuple[float, float], peak: float
 ) -> dict[str, Cell]:
     ratios = [theirs / ours for theirs, ours in zip(plain.seconds, timing.seconds, strict=True)]
     mean = sum(timing.squared) / len(timing.squared)
     total = sum(timing.seconds)
     row: dict[str, Cell] = {
-        "s a picture": round(total / options.poses, 3),
+        "s a picture": round(total / len(timing.seconds), 3),
         "ratio": f"{sum(plain.seconds) / total:.1f} [{min(ratios):.1f}, {max(ratios):.1f}]",
         "max error": None if timing is plain else float(f"{max(timing.largest):.1e}"),
         "PSNR": None if mean == 0 else round(-10 * math.log10(mean), 1),
@@ -406,5 +387,5 @@ def _row(
     row["TFLOP"] = round(counts[0] / 1e12, 4)
     row["GB"] = round(counts[1] / 1e9, 2)
     row["MB at most"] = None
-    row["s of the first pose"] = timing.seconds[0]
+    row["% of peak"] = round(100 * counts[0] / timing.seconds[0] / peak, 1)
     return row

@@ -10,6 +10,8 @@ from torch import Tensor
 from handavatar.geometry.meshes import SurfacePoints, sample_surface_evenly
 from handavatar.hand.rig import Rig
 
+NUM_NEIGHBOURS = 4
+"""The paper's N^n."""
 SMALLEST_DISTANCE = 1e-5
 """Distances are not taken smaller than this in inverse-distance weights, metres."""
 
@@ -48,7 +50,9 @@ def place_anchors(rig: Rig, count: int = 4096, seed: int = 0) -> SurfacePoints:
 
 
 def nearest_anchors(
-    anchors: Float[Tensor, "anchors 3"], queries: Float[Tensor, "queries 3"], count: int = 4
+    anchors: Float[Tensor, "anchors 3"],
+    queries: Float[Tensor, "queries 3"],
+    count: int = NUM_NEIGHBOURS,
 ) -> Neighbours:
     """The ``count`` nearest anchors by a k-d tree (a brute-force search on a GPU).
 

@@ -109,10 +109,14 @@ class ResidualBlock(nn.Module):
         """The block on every ``[feature, pooled]``, with the pooled half computed once per set."""
         width = features.shape[-1]
         own, common = self.inner.weight.split(width, dim=1)
-        shared = pooled.relu() @ common.T + self.inner.bias
-        hidden = (features.relu() @ own.T + shared[..., None, :]).relu()
+        shared = nn.functional.linear(pooled.relu(), common, self.inner.bias)
+        # In place: none of these products is needed by its own gradient.
+        hidden = (features.relu() @ own.T).add_(shared[..., None, :]).relu_()
         own, common = self.shortcut.weight.split(width, dim=1)
-        return self.outer(hidden) + features @ own.T + (pooled @ common.T)[..., None, :]
+        out = self.outer(hidden)
+        out += features @ own.T
+        out += (pooled @ common.T)[..., None, :]
+        return out
 
 
 class PointNet(nn.Module):
@@ -133,7 +137,7 @@ class PointNet(nn.Module):
     def forward(self, points: Float[Tensor, "*batch points width_in"]) -> Tensor:
         """``(*batch, width)`` if pooled, else ``(*batch, points, width)``."""
         features = self.blocks[0](self.input(points))
-        for block in list(self.blocks)[1:]:
+        for block in self.set_blocks:
             pooled = features.amax(-2, keepdim=True).expand_as(features)
             features = block(torch.cat([features, pooled], dim=-1))
         if self.is_pooled:

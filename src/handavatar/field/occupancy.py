@@ -11,13 +11,12 @@ hold the point, shares first layers between pairs, and is fast.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from handavatar.field.layers import PointNet, ResidualBlock, SkipMLP
+from handavatar.field.layers import PointNet, SkipMLP
 from handavatar.field.threads import mapped
 from handavatar.hand.parts import PartBoxes, Parts
 from handavatar.hand.pose import CONNECTED_PAIRS, NUM_BONES
@@ -315,11 +314,18 @@ class PairOccupancy(nn.Module):
     def _decode(
         self, codes: HandCodes, points: Float[Tensor, "points 3"], items: PairItems
     ) -> Float[Tensor, "items 2"]:
+        members, queries = self._members_and_queries(codes, points, items)
+        return self.decoder(codes.part_codes[members], queries)
+
+    def _members_and_queries(
+        self, codes: HandCodes, points: Float[Tensor, "points 3"], items: PairItems
+    ) -> tuple[Int[Tensor, "items 2"], Float[Tensor, "items 2 3"]]:
+        """The two parts of every item, and its point in their frames, times ``LENGTH_SCALE``."""
         members = self.pairs[items.pairs]
         transforms = codes.boxes.bone_from_world[members]
         position = points[items.points][:, None, :, None]
         queries = (transforms[..., :3, :3] @ position)[..., 0] + transforms[..., :3, 3]
-        return self.decoder(codes.part_codes[members], queries * LENGTH_SCALE)
+        return members, queries * LENGTH_SCALE
 
     def _wanted_logits(
         self, codes: HandCodes, points: Float[Tensor, "points 3"], items: PairItems
@@ -329,14 +335,11 @@ class PairOccupancy(nn.Module):
         The constant part code enters the first layer as a bias; the pooled half of every later
         block runs once per pair; the last block and the MLP run for wanted answers only.
         """
-        members = self.pairs[items.pairs]
-        transforms = codes.boxes.bone_from_world[members]
-        position = points[items.points][:, None, :, None]
-        queries = (transforms[..., :3, :3] @ position)[..., 0] + transforms[..., :3, 3]
+        members, queries = self._members_and_queries(codes, points, items)
         network = self.decoder.pointnet
         of_code, of_query = network.input.weight.split((CODE_WIDTH, 3), dim=1)
         biases = codes.part_codes @ of_code.T + network.input.bias
-        tokens = network.blocks[0](biases[members] + (LENGTH_SCALE * queries) @ of_query.T)
+        tokens = network.blocks[0](biases[members] + queries @ of_query.T)
         *between, last = network.set_blocks
         for block in between:
             tokens = block.of_set(tokens, tokens.amax(-2))
@@ -367,14 +370,12 @@ class PairOccupancy(nn.Module):
         members = self.pairs[pair_index]
         rows = row_of[members, point_index[:, None]]
         tokens = features[rows]
-        blocks = cast(list[ResidualBlock], list(self.decoder.pointnet.blocks))
-        for block in blocks[1:-1]:
-            tokens = _paired_block(block, tokens, tokens.amax(1))
+        *between, last = self.decoder.pointnet.set_blocks
+        for block in between:
+            tokens = block.of_set(tokens, tokens.amax(1))
         is_wanted = is_in_box[point_index[:, None], members]
         item_of_answer = is_wanted.nonzero()[:, 0]
-        answers = _paired_block(
-            blocks[-1], tokens[is_wanted][:, None], tokens.amax(1)[item_of_answer]
-        )[:, 0]
+        answers = last.of_set(tokens[is_wanted][:, None], tokens.amax(1)[item_of_answer])[:, 0]
         answers = self.decoder.pointnet.output(answers.relu_())
         logits = LOGIT_SCALE * self.decoder.mlp(answers)[:, 0]
 
@@ -453,19 +454,3 @@ def contains(
     lower, upper = boxes.lower - boxes.margin, boxes.upper + boxes.margin
     is_before_cut = (local[:, 0] - boxes.cut_point) @ boxes.cut_normal < 0
     return ((local > lower) & (local < upper)).all(-1) & is_before_cut[:, None]
-
-
-def _paired_block(
-    block: ResidualBlock,
-    tokens: Float[Tensor, "items members 64"],
-    pooled: Float[Tensor, "items 64"],
-) -> Float[Tensor, "items members 64"]:
-    """A residual block on ``[token, pooled]`` with the pooled half computed once per item."""
-    width = tokens.shape[-1]
-    inner, shortcut = block.inner, block.shortcut
-    shared = torch.addmm(inner.bias, pooled.relu(), inner.weight[:, width:].T)
-    hidden = (tokens.relu() @ inner.weight[:, :width].T).add_(shared[:, None]).relu_()
-    out = block.outer(hidden)
-    out += tokens @ shortcut.weight[:, :width].T
-    out += (pooled @ shortcut.weight[:, width:].T)[:, None]
-    return out

@@ -107,6 +107,30 @@ def project(
     return pixels + points.new_tensor(camera.center), depth
 
 
+def framing_camera(
+    points: Float[Tensor, "points 3"],
+    direction: tuple[float, float, float],
+    size: int,
+    distance: float,
+    room: float,
+) -> Camera:
+    """A square camera that sees all points, with the x axis downwards.
+
+    Args:
+        points: world, metres.
+        direction: from the middle of the points towards the camera; not along x.
+        size: pixels along a side.
+        distance: of the camera from the middle, metres.
+        room: the picture's side for the longest side of the points' box.
+    """
+    lower, upper = points.amin(0), points.amax(0)
+    middle, reach = (lower + upper) / 2, float((upper - lower).max())
+    towards = torch.nn.functional.normalize(torch.tensor(direction), dim=0)
+    focal = size * (distance - reach / 2) / (room * reach)
+    pose = look_at(middle + distance * towards, middle, torch.tensor([-1.0, 0.0, 0.0]))
+    return Camera((focal, focal), (size / 2, size / 2), size, size, pose)
+
+
 def look_at(
     eye: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]
 ) -> Float[Tensor, "4 4"]:

@@ -31,7 +31,7 @@ def subdivided(rig: Rig, rounds: int = 2) -> Rig:
     return rig
 
 
-def refined(rig: Rig, rounds: int = 2, file: Path | None = None) -> Rig:
+def refined(rig: Rig, rounds: int = 2, file: Path | None = None, fine: Rig | None = None) -> Rig:
     """A finer rig with refined skinning weights, at most four bones per vertex.
 
     Without ``file`` it takes the weights that ship for this very rig and number of rounds; where
@@ -41,13 +41,14 @@ def refined(rig: Rig, rounds: int = 2, file: Path | None = None) -> Rig:
         rig: any rig.
         rounds: midpoint subdivisions.
         file: weights written by ``handavatar rig refine``.
+        fine: the subdivided rig, where it is at hand.
 
     Raises:
         RigError: if the file is damaged or was made for another rig.
 
     Source: paper appendix A, optimization of MANO-HD.
     """
-    fine = subdivided(rig, rounds)
+    fine = fine or subdivided(rig, rounds)
     if file is not None:
         skin = SparseSkin.load(file)
         if not skin.fits(rig, rounds):

@@ -178,7 +178,7 @@ def finer_rig(base: Rig, rounds: int) -> tuple[Rig, Parts]:
     """
     known = subdivided(base, min(rounds, POINT_ROUNDS))
     averaged = subdivided(known, max(rounds - POINT_ROUNDS, 0))
-    return refined(base, rounds), divide_into_parts(averaged, drawn_on=known)
+    return refined(base, rounds, fine=averaged), divide_into_parts(averaged, drawn_on=known)
 
 
 def _require_coarser(coarse: Rig, fine: Rig) -> None:

@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -42,6 +43,9 @@ from handavatar.train.runs import write_json
 
 Measure = Callable[[OccupancyField, HandCodes, PosedHand], Mapping[str, float]]
 """Further columns by name, of one field on one posed hand: how good a mesh extracted from it is."""
+
+Judges = tuple[Parts, list[LabelledPose]]
+"""The parts of a guide, and the unseen poses of it that judge."""
 
 ATTENTION_GESTURES = ("flat", "fist")
 
@@ -156,9 +160,21 @@ def compare_decoders(
     rows: dict[str, DecoderScores] = {}
     guides: dict[str, DecoderScores] = {}
     attention: dict[str, Any] = {}
+
+    @cache
+    def judged_by(rounds: int) -> Judges:
+        options_of = PriorEvaluationOptions(
+            poses=options.poses,
+            points=options.judged_points,
+            level=options.level,
+            rounds=rounds,
+        )
+        return evaluation_poses(options_of, untrained_field("pair").margin)
+
     for contender in contenders(options):
         trainings = [
-            _training(options, contender, seed, measures, report) for seed in options.seeds
+            _training(options, contender, seed, judged_by, measures, report)
+            for seed in options.seeds
         ]
         scores = DecoderScores.of(trainings)
         (rows if contender.rounds == options.rounds else guides)[contender.name] = scores
@@ -199,8 +215,8 @@ def comparison_table(value: Mapping[str, Any]) -> ResultTable:
     if "control_hurts" in value:
         hurts = "hurt" if value["control_hurts"] else "do not hurt: the table says nothing"
         notes.append(f"Control: shuffled pairs {hurts}.")
-    rows = {name: _cells(row, "pair") for name, row in value["decoders"].items()}
-    rows |= {name: _cells(row, None) for name, row in value["guides"].items()}
+    rows = {name: _cells(row) for name, row in value["decoders"].items()}
+    rows |= {name: _cells(row) for name, row in value["guides"].items()}
     for name, row in value["guides"].items():
         differences = [
             f"{column} {_interval(interval)}"
@@ -217,17 +233,15 @@ _OWN_FIGURES = (
 )
 
 
-def _cells(row: Mapping[str, Any], other: str | None) -> dict[str, Cell]:
-    difference = row.get(f"minus_{other}", {}).get("iou")
-    seeds = row.get(f"minus_{other}_over_seeds", {}).get("iou")
+def _cells(row: Mapping[str, Any]) -> dict[str, Cell]:
+    poses = row.get("minus_pair", {}).get("iou")
+    seeds = row.get("minus_pair_over_seeds", {}).get("iou")
     cells: dict[str, Cell] = {
         "parameters": row["parameters"],
         "IoU": round(100 * row["iou"], 2),
         "in boxes": round(100 * row["iou_boxes"], 2),
         "near surface": round(100 * row["iou_surface"], 2),
-        "IoU - pair [95 % over poses]": None
-        if difference is None
-        else _interval(difference, 100.0),
+        "IoU - pair [95 % over poses]": None if poses is None else _interval(poses, 100.0),
         "IoU - pair [95 % over seeds]": None if seeds is None else _interval(seeds, 100.0),
         "IoU per 100K": round(row["iou_points_per_100k"], 1),
     }
@@ -270,6 +284,7 @@ def _training(
     options: ComparisonOptions,
     contender: Contender,
     seed: int,
+    judged_by: Callable[[int], Judges],
     measures: Sequence[Measure],
     report: Callable[[str, int, dict[str, float]], None] | None,
 ) -> dict[str, Any]:
@@ -304,16 +319,7 @@ def _training(
         None if report is None else lambda step, figures: report(name, step, figures),
     ).to("cpu")
     seconds = time.perf_counter() - start
-    parts, samples = evaluation_poses(
-        PriorEvaluationOptions(
-            poses=options.poses,
-            points=options.judged_points,
-            level=options.level,
-            rounds=contender.rounds,
-        ),
-        field.margin,
-    )
-    columns = _columns(field, parts, samples, options, measures)
+    columns = _columns(field, *judged_by(contender.rounds), options, measures)
     training = {
         "options": depends_on,
         "versions": package_versions(),

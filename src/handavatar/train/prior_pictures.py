@@ -12,7 +12,7 @@ from torch import Tensor
 
 from handavatar.evaluate.geometry import Skin, Truth
 from handavatar.field.decoders import OccupancyField
-from handavatar.geometry.cameras import Camera, look_at
+from handavatar.geometry.cameras import framing_camera
 from handavatar.geometry.extraction import Field
 from handavatar.hand.open_hand import Level
 from handavatar.hand.parts import POINT_ROUNDS, finer_rig
@@ -34,6 +34,7 @@ VIEWS: dict[str, tuple[float, float, float]] = {
 """Where the camera stands, in the hand's rest axes."""
 
 _DISTANCE = 1.2
+_ROOM = 1 / 0.92
 _TITLE = 18
 
 FieldOf = Callable[[PosedHand], Field]
@@ -112,19 +113,8 @@ def side_by_side(
         frame: points (metres) that fill every picture.
         size: edge of one picture, pixels.
     """
-    lower, upper = frame.amin(0), frame.amax(0)
-    middle, reach = (lower + upper) / 2, float((upper - lower).max())
-    focal = 0.92 * size * (_DISTANCE - reach / 2) / reach
     cameras = {
-        name: Camera(
-            (focal, focal),
-            (size / 2, size / 2),
-            size,
-            size,
-            look_at(
-                middle + _DISTANCE * torch.tensor(direction), middle, torch.tensor([-1.0, 0, 0])
-            ),
-        )
+        name: framing_camera(frame, direction, size, _DISTANCE, _ROOM)
         for name, direction in VIEWS.items()
     }
     rows = []

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 
 from handavatar.avatar import EXACT, HandAvatar, HandState, RayValues, RenderSettings
-from handavatar.evaluate.speed_table import framing_camera
+from handavatar.evaluate.speed_table import hand_camera
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
-from handavatar.field.occupancy import PairOccupancy, hand_codes
+from handavatar.field.occupancy import BOX_MARGIN, PairOccupancy, hand_codes
 from handavatar.geometry.cameras import Rays, pixel_centers, rays_through_pixels
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
@@ -124,7 +124,7 @@ def _patch_rows(
     pose = HandPose(gesture_rotations(avatar.base_rig, "relaxed"), torch.zeros(3))
     with torch.no_grad():
         posed = avatar.prepare(pose).posed
-    camera = framing_camera(posed.vertices, (0.0, -1.0, 0.0), _PICTURE)
+    camera = hand_camera(posed.vertices, (0.0, -1.0, 0.0), _PICTURE)
     start = (_PICTURE - options.patch) // 2
     window = slice(start, start + options.patch)
     rays = rays_through_pixels(camera, pixel_centers(camera)[window, window].flatten(0, 1))
@@ -221,22 +221,11 @@ def gradient_error(expected: dict[str, Tensor], found: dict[str, Tensor]) -> flo
 # --- a step of pre-training -----------------------------------------------------------------------
 
 
-class _PlainLoss(nn.Module):
-    """Cross entropy with every pair at every point."""
-
-    def __init__(self, field: PairOccupancy, parts: Parts) -> None:
-        super().__init__()
-        self.field = field
-        self.parts = parts
-
-    def forward(self, samples: list[LabelledPose]) -> Tensor:
-        losses = []
-        for sample in samples:
-            codes = hand_codes(self.field.encoder, self.parts, sample.posed, self.field.margin)
-            predicted, _ = self.field.plain(codes, sample.points)
-            target = sample.is_inside.to(predicted)
-            losses.append(nn.functional.binary_cross_entropy(predicted, target))
-        return torch.stack(losses).mean()
+def _plain_loss(field: PairOccupancy, parts: Parts, sample: LabelledPose) -> Tensor:
+    """Cross entropy with every pair at every point, and nothing shared in the encoder."""
+    codes = hand_codes(field.encoder, parts, sample.posed, field.margin)
+    predicted, _ = field.plain(codes, sample.points)
+    return nn.functional.binary_cross_entropy(predicted, sample.is_inside.to(predicted))
 
 
 def _step_seconds(
@@ -245,20 +234,9 @@ def _step_seconds(
     """Mean seconds of a step, plain and ours; the two take turns."""
     base = load_open_hand("full")
     rig, parts = finer_rig(base, POINT_ROUNDS)
-    spent = {"plain": 0.0, "ours": 0.0}
-    steps = {}
-    for name in spent:
-        field = PairOccupancy()
-        load_prior(field)
-        stream = PoseStream(base, rig, parts, field.margin, options.points, seed=0)
-        loss_of = (
-            _PlainLoss(field, parts)
-            if name == "plain"
-            else OccupancyLoss(field, parts, StageTimes())
-        )
-        optimizers = prior_optimizers(field)
-        set_rate(optimizers, _RATE)
-        steps[name] = _step(stream, loss_of, optimizers)
+    stream = PoseStream(base, rig, parts, BOX_MARGIN, options.points, seed=0)
+    steps = {"plain": _step(stream, is_plain=True), "ours": _step(stream, is_plain=False)}
+    spent = dict.fromkeys(steps, 0.0)
     for number in range(options.steps):
         for name, step in steps.items():
             begin = time.perf_counter()
@@ -268,13 +246,20 @@ def _step_seconds(
     return spent["plain"] / options.steps, spent["ours"] / options.steps
 
 
-def _step(
-    stream: PoseStream, loss_of: nn.Module, optimizers: dict[str, torch.optim.Optimizer]
-) -> Callable[[int], None]:
+def _step(stream: PoseStream, is_plain: bool) -> Callable[[int], None]:
+    """A step, by its number, of a field of its own."""
+    field = PairOccupancy()
+    load_prior(field)
+    learned = OccupancyLoss(field, stream.parts, StageTimes())
+    optimizers = prior_optimizers(field)
+    set_rate(optimizers, _RATE)
+
     def step(number: int) -> None:
+        sample = stream.drawn(number, StageTimes())
         for optimizer in optimizers.values():
             optimizer.zero_grad(set_to_none=True)
-        loss_of([stream.drawn(number, StageTimes())]).backward()
+        loss = _plain_loss(field, stream.parts, sample) if is_plain else learned([sample])
+        loss.backward()
         for optimizer in optimizers.values():
             optimizer.step()
 
