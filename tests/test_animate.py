@@ -220,14 +220,13 @@ def test_the_error_of_every_frame_is_stated_on_request(
     assert not (tmp_path / "near" / "errors").exists()
 
 
-def test_a_margin_that_cuts_the_hand_is_found_out(small_avatar: HandAvatar) -> None:
-    """The error is looked for beyond the settings' own margin too."""
+def test_what_coarse_samples_miss_is_found_out(small_avatar: HandAvatar) -> None:
     camera = camera_above(32)
     settings = RenderSettings(mask_margin=2 / 32)
     good = rendering_error(small_avatar, bent_pose(1), camera, settings, 1000)
-    # A rim of some pixels, within which the field of a small mesh reaches.
-    cut = rendering_error(small_avatar, bent_pose(1), camera, replace(settings, coarse=32), 1000)
-    assert good["psnr"] > 60 > cut["psnr"]
+    # Two or three looks along a ray, between which fingers lie.
+    blind = rendering_error(small_avatar, bent_pose(1), camera, replace(settings, coarse=32), 1000)
+    assert good["psnr"] > 60 > blind["psnr"]
 
 
 def _contents(folder: Path) -> dict[str, bytes]:
