@@ -65,6 +65,7 @@ def extract_surface(
     level: float = 0.0,
     coarsest: int = 32,
     seeds: Float[Tensor, "seeds 3"] | None = None,
+    corrections: int = 0,
 ) -> ExtractedSurface:
     """The level set of a field inside a box.
 
@@ -83,6 +84,8 @@ def extract_surface(
         coarsest: the grid is halved while it has more cells than this along the longest side.
         seeds: points near the surface, such as a posed mesh's vertices, so that nothing thin is
             lost between coarse samples.
+        corrections: how often the field is asked at the vertices, each of which then moves along
+            its grid edge to where the answer says; worth it for fields that bend within a voxel.
 
     Raises:
         ValueError: an empty box, a resolution below 2, or a field that answers NaN.
@@ -109,7 +112,7 @@ def extract_surface(
     grid.examine(np.arange(int(cells.prod())))
     for left in reversed(range(halvings)):
         grid = grid.halved(seeds, neighbours=left > 0)
-    vertices, faces = grid.marched()
+    vertices, faces = grid.marched(corrections)
     num_dense = int((np.array(grid.cells) + 1).prod())
     return ExtractedSurface(
         torch.from_numpy(vertices).to(lower),
@@ -221,7 +224,7 @@ class _Grid:
         finer.examine(np.ravel_multi_index(tuple(children.T), finer.cells))
         return finer
 
-    def marched(self) -> tuple[np.ndarray, np.ndarray]:
+    def marched(self, corrections: int) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and outward faces of the crossed cells."""
         crossed = np.argwhere(self.is_crossed)
         if len(crossed) == 0:
@@ -235,8 +238,33 @@ class _Grid:
         vertices, faces, _ = igl.marching_cubes(
             values, places.astype(np.float64), corners.reshape(-1, 8).astype(np.int64), 0.0
         )
+        if corrections:
+            vertices = self._corrected(vertices, corrections)
         # libigl winds for a field that is greater outside.
         return self.origin + self.voxel * vertices, np.ascontiguousarray(faces[:, ::-1])
+
+    def _corrected(self, vertices: np.ndarray, corrections: int) -> np.ndarray:
+        """Every vertex at the zero along its edge of the grid, by false position; in voxels."""
+        row, axis = np.arange(len(vertices)), np.abs(vertices - np.rint(vertices)).argmax(1)
+        start = np.rint(vertices).astype(int)
+        start[row, axis] = np.floor(vertices[row, axis])
+        direction = np.eye(3, dtype=int)[axis]
+        end = np.minimum(start + direction, self.cells)
+        # The field was not asked for what closes the mesh at the border.
+        is_asked = ((start > 0) & (end < self.cells)).all(1)
+        start, end, direction = start[is_asked], end[is_asked], direction[is_asked]
+        low, high = np.zeros(len(start)), np.ones(len(start))
+        at_low, at_high = (self.values[tuple(side.T)] - float(self.level) for side in (start, end))
+        along = ((vertices[is_asked] - start) * direction).sum(1)
+        for _ in range(corrections):
+            found = self._answers(start + along[:, None] * direction) - self.level
+            is_low = (found > 0) == (at_low > 0)
+            low, at_low = np.where(is_low, along, low), np.where(is_low, found, at_low)
+            high, at_high = np.where(is_low, high, along), np.where(is_low, at_high, found)
+            along = low + (high - low) * (at_low / (at_low - at_high)).clip(1e-4, 1 - 1e-4)
+        corrected = vertices.copy()
+        corrected[is_asked] = start + along[:, None] * direction
+        return corrected
 
     def _corners(self, places: np.ndarray) -> np.ndarray:
         corners = places[:, None] + _CORNERS
@@ -245,21 +273,27 @@ class _Grid:
     def _evaluate(self, samples: np.ndarray) -> None:
         values = self.values.reshape(-1)
         unknown = samples[np.isnan(values[samples])]
-        for start in range(0, len(unknown), POINTS_AT_ONCE):
-            chosen = unknown[start : start + POINTS_AT_ONCE]
-            places = np.stack(np.unravel_index(chosen, self.samples), axis=-1)
-            points = torch.from_numpy(self.origin + self.voxel * places).to(self.like)
-            answers = self.values_of(points).double().cpu().numpy()
-            if np.isnan(answers).any():
-                where = points[int(np.isnan(answers).argmax())].tolist()
+        places = np.stack(np.unravel_index(unknown, self.samples), axis=-1)
+        answers = self._answers(places)
+        is_border = ((places == 0) | (places == np.array(self.cells))).any(1)
+        distance = np.abs(answers - self.level)
+        values[unknown] = np.where(is_border, self.level - distance, answers)
+
+    def _answers(self, places: np.ndarray) -> np.ndarray:
+        """What the field answers at these places, in voxels."""
+        answers = np.empty(len(places))
+        for start in range(0, len(places), POINTS_AT_ONCE):
+            chosen = places[start : start + POINTS_AT_ONCE]
+            points = torch.from_numpy(self.origin + self.voxel * chosen).to(self.like)
+            values = self.values_of(points).double().cpu().numpy()
+            if np.isnan(values).any():
+                where = points[int(np.isnan(values).argmax())].tolist()
                 raise ValueError(
                     f"extraction: the field answers NaN at {where} m, and at "
-                    f"{int(np.isnan(answers).sum())} of {len(answers)} points; expected numbers: "
+                    f"{int(np.isnan(values).sum())} of {len(values)} points; expected numbers: "
                     "check the weights and the posed vertices for NaN"
                 )
             # Infinity has no place between two samples; this keeps its side.
-            answers = np.clip(answers, self.level - 1e3, self.level + 1e3)
-            is_border = ((places == 0) | (places == np.array(self.cells))).any(1)
-            distance = np.abs(answers - self.level)
-            values[chosen] = np.where(is_border, self.level - distance, answers)
-        self.num_evaluations += len(unknown)
+            answers[start : start + len(chosen)] = values.clip(self.level - 1e3, self.level + 1e3)
+        self.num_evaluations += len(places)
+        return answers

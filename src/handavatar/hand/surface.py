@@ -12,6 +12,9 @@ from handavatar.hand.rig import PosedHand
 CUT_SLOPE = 1000.0
 """Logits per metre at the wrist's cut: a few per voxel, as the field has at the skin."""
 
+CORRECTIONS = 2
+"""A decoder's logits bend within a voxel of a millimetre: uncorrected, smooth skin has terraces."""
+
 
 def extract_hand(
     occupancy_of: Field, boxes: PartBoxes, posed: PosedHand, resolution: int = 256
@@ -48,4 +51,11 @@ def extract_hand(
         answered = points - (beyond + 1e-5).clamp_min(0)[:, None] * normal
         return torch.minimum(logits(answered), -CUT_SLOPE * beyond)
 
-    return extract_surface(values_of, lower - padding, upper + padding, resolution, seeds=vertices)
+    return extract_surface(
+        values_of,
+        lower - padding,
+        upper + padding,
+        resolution,
+        seeds=vertices,
+        corrections=CORRECTIONS,
+    )
