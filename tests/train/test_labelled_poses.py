@@ -72,3 +72,19 @@ def test_most_points_lie_near_the_surface_and_some_anywhere() -> None:
     distance = distance_to_mesh(sample.posed.sealed_vertices, RIG.sealed_faces, sample.points)
     assert float((distance[-461:] < 0.001).float().mean()) > 0.6
     assert float((distance[:51] > 0.002).float().mean()) > 0.6
+
+
+def test_points_at_joints_lie_where_several_bones_move_the_skin() -> None:
+    posed = RIG.shaped().posed(HandPose(torch.zeros(16, 3), torch.zeros(3)))
+
+    def share_at_joints(joint_share: float) -> float:
+        generator = torch.Generator().manual_seed(0)
+        points = training_points(PARTS, posed, 4000, 0.012, generator, joint_share)
+        near = points[-3600:]
+        assert (distance_to_mesh(near, posed.sealed_vertices, RIG.sealed_faces) < 0.02).all()
+        face = closest_points(near, posed.vertices, RIG.faces).faces
+        return float((RIG.skin_weights[RIG.faces[face]].mean(1).amax(-1) < JOINT_WEIGHT).float().mean())
+
+    assert share_at_joints(0.0) < 0.35
+    assert share_at_joints(0.5) > 0.5
+    assert share_at_joints(1.0) > 0.75

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from handavatar.field.shape import personal_hand
@@ -25,6 +25,8 @@ SURFACE_SIGMAS = (0.00025, 0.0005, 0.001, 0.003)
 """Noise of training points at the surface, metres, in equal shares."""
 SURFACE_SHARE = 0.9
 """Share of the training points near the surface; the others lie anywhere in the part boxes."""
+JOINT_WEIGHT = 0.7
+"""Where no bone has more of a face than this, the face is at a joint: a sixth of the skin."""
 LARGEST_OFFSET = 0.002
 """Of people's hands from the rig's: standard deviation along each axis, at most, metres."""
 _WAVES = 8
@@ -88,6 +90,7 @@ class PoseStream:
         margin: of the part boxes, metres.
         points: on each hand.
         seed: of everything.
+        joint_share: of the points near the surface, those at joints: see :func:`training_points`.
     """
 
     base: Rig
@@ -96,6 +99,7 @@ class PoseStream:
     margin: float
     points: int
     seed: int
+    joint_share: float = 0.0
 
     def drawn(self, number: int, times: StageTimes) -> LabelledPose:
         """Hand ``number`` of the stream."""
@@ -107,18 +111,26 @@ class PoseStream:
             hand = _random_shape(self.rig, generator)
             posed = hand.posed(HandPose(rotations, torch.zeros(3)))
         with times.stage("points"):
-            points = training_points(self.parts, posed, self.points, self.margin, generator)
+            points = training_points(
+                self.parts, posed, self.points, self.margin, generator, self.joint_share
+            )
         with times.stage("labels"):
             labels = is_inside(posed.sealed_vertices, self.rig.sealed_faces, points)
         return LabelledPose(posed, points, labels)
 
 
 def training_points(
-    parts: Parts, posed: PosedHand, count: int, margin: float, generator: torch.Generator
+    parts: Parts,
+    posed: PosedHand,
+    count: int,
+    margin: float,
+    generator: torch.Generator,
+    joint_share: float = 0.0,
 ) -> Float[Tensor, "points 3"]:
     """Points to learn from: a few in the part boxes first, then those near the surface.
 
-    Without gradient and on the CPU.
+    Without gradient and on the CPU. Of the latter ``joint_share`` lie at joints, where several
+    bones move the skin and one part of a field hands over to the next.
 
     Departs: COAP and the paper draw half the points in the boxes and half near the surface, with
         noise of one sigma. Nine in ten errors of a trained field lie within half a millimetre of
@@ -127,7 +139,14 @@ def training_points(
     num_near = round(count * SURFACE_SHARE)
     uniform = _box_points(parts, posed, count - num_near, margin, generator)
     sigmas = torch.tensor(SURFACE_SIGMAS)[torch.arange(num_near) % len(SURFACE_SIGMAS)]
-    return torch.cat([uniform, _surface_points(posed, sigmas, generator)])
+    num_at_joints = round(num_near * joint_share)
+    near = _surface_points(posed, sigmas[num_at_joints:], generator)
+    if not num_at_joints:
+        return torch.cat([uniform, near])
+    rig = posed.rig
+    is_joint = rig.skin_weights[rig.faces].mean(1).amax(-1) < JOINT_WEIGHT
+    at_joints = _surface_points(posed, sigmas[:num_at_joints], generator, rig.faces[is_joint])
+    return torch.cat([uniform, at_joints, near])
 
 
 def random_person(rest: ShapedHand, generator: torch.Generator) -> ShapedHand:
@@ -164,10 +183,14 @@ def _box_points(
 
 
 def _surface_points(
-    posed: PosedHand, sigmas: Float[Tensor, "points"], generator: torch.Generator
+    posed: PosedHand,
+    sigmas: Float[Tensor, "points"],
+    generator: torch.Generator,
+    faces: Int[Tensor, "faces 3"] | None = None,
 ) -> Float[Tensor, "points 3"]:
-    """Points of the sealed surface with noise of so many metres in every direction."""
-    sealed, faces = posed.sealed_vertices.detach().cpu(), posed.rig.sealed_faces.cpu()
+    """Points of the sealed surface, or of the given faces, with noise of so many metres."""
+    sealed = posed.sealed_vertices.detach().cpu()
+    faces = (posed.rig.sealed_faces if faces is None else faces).cpu()
     surface = sample_surface(sealed, faces, len(sigmas), generator)
     noise = torch.randn(len(sigmas), 3, generator=generator)
     return surface.positions(sealed) + sigmas[:, None] * noise

@@ -71,6 +71,8 @@ class PriorOptions:
         steps: optimisation steps.
         poses: poses per step, all of them new; processes share them.
         points: labelled points per pose.
+        joint_share: how much of those near the surface is drawn at joints alone, in [0, 1]; for
+            the last steps, so that no seam is left where parts meet.
         lr: the highest learning rate, soon after the start.
         final_lr: learning rate at the end; half a cosine in between.
         rig: the hand: ``open-hand``, an imported one (``mano-right``) or its file.
@@ -90,6 +92,7 @@ class PriorOptions:
     steps: int = 10_000
     poses: int = 1
     points: int = 1024
+    joint_share: float = 0.0
     lr: float = 1e-3
     final_lr: float = 5e-5
     rig: str = "open-hand"
@@ -121,8 +124,11 @@ def train_prior(
         CheckpointError: if ``folder`` holds something else than a run with these options.
         Interrupted: after SIGINT or SIGTERM; a checkpoint was saved if there is a ``folder``.
         RigError: if there is no such rig, or not at this level.
-        ValueError: if the processes cannot share the poses of a step evenly.
+        ValueError: if the processes cannot share the poses of a step evenly, or on a share that is
+            none.
     """
+    if not 0 <= options.joint_share <= 1:
+        raise ValueError(f"prior: found the joint share {options.joint_share}, expected 0 to 1")
     base = load_rig(options.rig, options.level)
     with joined_processes(options.device) as processes, stop_signals() as stopped:
         if options.poses % processes.count:
@@ -162,7 +168,9 @@ def _trained(
         if not processes.is_first:
             done, average = load_progress(Run(options.folder), field, optimizers)
     rig, parts = finer_rig(base, options.rounds)
-    stream = PoseStream(base, rig, parts, field.margin, options.points, options.seed)
+    stream = PoseStream(
+        base, rig, parts, field.margin, options.points, options.seed, options.joint_share
+    )
     times = StageTimes()
     loss_of: nn.Module = OccupancyLoss(field, parts.to(processes.device), times)
     if processes.count > 1:
