@@ -84,6 +84,32 @@ def test_logits_find_the_surface_better_than_occupancies() -> None:
     assert by_logits < 0.01 and by_occupancy > 10 * by_logits
 
 
+def test_corrections_find_the_surface_of_a_field_that_bends() -> None:
+    """Within a voxel the values change as a decoder's do: steep at the surface, flat beside it."""
+    distances = _sphere()
+    centre = torch.tensor([0.003, -0.002, 0.001])
+
+    def bent(points: Tensor) -> Tensor:
+        return torch.asinh(5000 * distances(points)) + 600 * distances(points).square()
+
+    errors, asked = [], []
+    for corrections in (0, 1, 2):
+        surface = extract_surface(bent, LOWER, UPPER, 64, corrections=corrections)
+        assert _solid(surface).is_watertight and _solid(surface).volume > 0
+        errors.append(float(((surface.vertices - centre).norm(dim=-1) - 0.06).abs().mean()))
+        asked.append(surface.num_evaluations)
+    assert errors[1] < 0.4 * errors[0] and errors[2] < 0.1 * errors[0]
+    assert asked[2] - asked[1] == asked[1] - asked[0] == len(surface.vertices)
+
+
+def test_corrections_leave_the_border_where_the_box_cuts_the_inside() -> None:
+    plain, corrected = (
+        extract_surface(lambda points: 0.2 - points.norm(dim=-1), LOWER, UPPER, 16, corrections=n)
+        for n in (0, 2)
+    )
+    assert torch.equal(plain.vertices, corrected.vertices)
+
+
 @pytest.mark.parametrize("field", [_sphere(), _torus], ids=["sphere", "torus"])
 @pytest.mark.parametrize("coarsest", [6, 12])
 def test_adaptive_equals_dense(field: Values, coarsest: int) -> None:

@@ -140,13 +140,15 @@ def training_points(
     uniform = _box_points(parts, posed, count - num_near, margin, generator)
     sigmas = torch.tensor(SURFACE_SIGMAS)[torch.arange(num_near) % len(SURFACE_SIGMAS)]
     num_at_joints = round(num_near * joint_share)
-    near = _surface_points(posed, sigmas[num_at_joints:], generator)
-    if not num_at_joints:
-        return torch.cat([uniform, near])
-    rig = posed.rig
-    is_joint = rig.skin_weights[rig.faces].mean(1).amax(-1) < JOINT_WEIGHT
-    at_joints = _surface_points(posed, sigmas[:num_at_joints], generator, rig.faces[is_joint])
-    return torch.cat([uniform, at_joints, near])
+    pieces = [uniform]
+    if num_at_joints:
+        rig = posed.rig
+        is_joint = rig.skin_weights[rig.faces].mean(1).amax(-1) < JOINT_WEIGHT
+        at_joints = rig.faces[is_joint]
+        pieces.append(_surface_points(posed, sigmas[:num_at_joints], generator, at_joints))
+    if num_at_joints < num_near:
+        pieces.append(_surface_points(posed, sigmas[num_at_joints:], generator))
+    return torch.cat(pieces)
 
 
 def random_person(rest: ShapedHand, generator: torch.Generator) -> ShapedHand:
