@@ -246,6 +246,7 @@ def _contents(folder: Path) -> dict[str, bytes]:
         ({"lift_shadow": "pinky"}, "neither a finger nor a bone"),
         ({"size": 0}, "size"),
         ({"frames": 0}, "frames"),
+        ({"kernel": "triton", "device": "cpu"}, "kernel"),
     ],
 )
 def test_bad_options_are_errors_before_any_work(

@@ -17,6 +17,7 @@ from handavatar.avatar import (
     HandAvatar,
     Rendering,
     RenderSettings,
+    chosen_kernel,
 )
 from handavatar.edit import Edit, bones_named
 from handavatar.field.shading import OrientedCues
@@ -78,6 +79,32 @@ def test_pieces_of_rays_do_not_matter(small_avatar: HandAvatar, rendering: Rende
     for name, value in vars(rendering).items():
         # Matrix products of other sizes round otherwise: as between fast and plain occupancy.
         torch.testing.assert_close(getattr(pieced, name), value, atol=1e-4, rtol=0)
+
+
+def test_a_batch_is_rendered_as_its_hands_are_one_by_one(small_avatar: HandAvatar) -> None:
+    poses = [bent_pose(seed) for seed in (1, 2, 3)]
+    cameras = [camera_above(size) for size in (16, 24, 20)]
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        found = small_avatar.render_batch(poses, cameras)
+    finally:
+        torch.set_num_threads(threads)
+    for picture, pose, camera in zip(found, poses, cameras, strict=True):
+        assert torch.equal(picture.color, small_avatar.render(pose, camera).color)
+    with pytest.raises(ValueError, match="3 poses and 2 cameras"):
+        small_avatar.render_batch(poses, cameras[:2])
+
+
+def test_a_kernel_that_cannot_run_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert chosen_kernel("torch", "cpu") == "torch"
+    monkeypatch.setattr("handavatar.avatar.find_spec", lambda name: object())
+    assert chosen_kernel("triton-tf32", "cuda:0") == "triton-tf32"
+    with pytest.raises(ValueError, match="--kernel triton: needs a CUDA device, found cpu"):
+        chosen_kernel("triton", "cpu")
+    monkeypatch.setattr("handavatar.avatar.find_spec", lambda name: None)
+    with pytest.raises(ValueError, match="no package 'triton'"):
+        chosen_kernel("triton", "cuda")
 
 
 def test_at_the_outline_a_pixel_is_the_mean_of_four_rays(

@@ -20,9 +20,17 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chosen_device
+from handavatar.avatar import (
+    EXACT,
+    HandAvatar,
+    Rendering,
+    RenderSettings,
+    chosen_device,
+    chosen_kernel,
+)
 from handavatar.capture.motion import MOTIONS, Motion, named_motion, read_motion
 from handavatar.edit import Edit, bones_named
+from handavatar.field.occupancy import Kernel
 from handavatar.geometry.cameras import Camera, look_at, project
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
@@ -55,6 +63,8 @@ class RenderOptions:
         lift_shadow: fingers or bones that cast no shadow, comma-separated.
         overwrite: replace what lies at ``out``.
         device: where the fields run.
+        kernel: what decodes pairs of parts; ``triton`` is for NVIDIA GPUs, with ``-tf32`` or
+            ``-bf16`` for products of shorter numbers.
     """
 
     run: Path
@@ -72,6 +82,7 @@ class RenderOptions:
     lift_shadow: str = ""
     overwrite: bool = False
     device: str = "auto"
+    kernel: Kernel = "torch"
 
 
 def render_motion(options: RenderOptions) -> Path:
@@ -105,6 +116,7 @@ def render_motion(options: RenderOptions) -> Path:
             )
     edit = edit_from(options.light_gain, options.albedo_shift, options.lift_shadow)
     device = str(chosen_device(options.device))
+    kernel = chosen_kernel(options.kernel, device)
     avatar = HandAvatar.load(options.run)
     motion = _chosen_motion(avatar, options.motion)
     poses = [motion.pose(step) for step in _spread(len(motion), options.frames)]
@@ -115,7 +127,7 @@ def render_motion(options: RenderOptions) -> Path:
         turns = [2 * math.pi * index / len(poses) for index in range(len(poses))]
         views = [orbited(camera, middle, turn) for turn in turns]
     settings = EXACT if options.quality == "exact" else RenderSettings()
-    settings = replace(settings, num_samples=options.num_samples)
+    settings = replace(settings, num_samples=options.num_samples, kernel=kernel)
     folder = UnfinishedFolder(options.out, _what_frames_depend_on(avatar, options, poses, views))
     with joined_processes(device) as processes:
         avatar.moved_to(processes.device)

@@ -7,7 +7,9 @@ ray; training and rendering go through the same two calls.
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ from torch import Tensor, nn
 
 from handavatar.edit import Edit
 from handavatar.field.anchors import Neighbours, nearest_anchors, place_anchors
-from handavatar.field.occupancy import HandCodes, PairItems, PairOccupancy
+from handavatar.field.occupancy import HandCodes, Kernel, PairItems, PairOccupancy
 from handavatar.field.shading import (
     AlbedoField,
     IlluminationField,
@@ -28,6 +30,7 @@ from handavatar.field.shading import (
     directed_occupancy,
 )
 from handavatar.field.shape import ShapeOffsets, personal_hand
+from handavatar.field.threads import mapped
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
 from handavatar.hand.parts import finer_rig
@@ -66,6 +69,26 @@ def chosen_device(name: str) -> torch.device:
     return torch.device(name)
 
 
+def chosen_kernel(name: Kernel, device: torch.device | str) -> Kernel:
+    """What decodes pairs on a device.
+
+    Raises:
+        ValueError: if Triton is asked for where it is missing or there is no NVIDIA GPU.
+    """
+    if name == "torch":
+        return name
+    if find_spec("triton") is None:
+        raise ValueError(
+            f"--kernel {name}: there is no package 'triton' here; it comes with torch's builds for "
+            "CUDA; use --kernel torch"
+        )
+    if torch.device(device).type != "cuda":
+        raise ValueError(
+            f"--kernel {name}: needs a CUDA device, found {device}; use --kernel torch"
+        )
+    return name
+
+
 class CheckpointError(ValueError):
     """A file of weights that cannot be used: which, what is wrong with it, what to do."""
 
@@ -91,6 +114,7 @@ class RenderSettings:
         edge_rays: at the hand's outline a pixel is the mean of so many rays in both directions; a
             single one says all or nothing of a pixel that the hand covers in part.
         rays_at_once: bounds the memory.
+        kernel: what decodes pairs of parts; see :func:`chosen_kernel`.
     """
 
     num_samples: int = 64
@@ -102,6 +126,7 @@ class RenderSettings:
     mask_margin: float = 6 / 256
     edge_rays: int = 2
     rays_at_once: int = 4096
+    kernel: Kernel = "torch"
 
 
 EXACT = RenderSettings(smallest_weight=1e-7, stop=1e-7, coarse=1, mask_margin=math.inf)
@@ -409,7 +434,7 @@ class HandAvatar(nn.Module):
         def evaluate(flat: Int[Tensor, "samples"]) -> None:
             ray = flat // num_samples
             points = rays.origins[ray] + depths.view(-1)[flat][:, None] * rays.directions[ray]
-            result = self.occupancy(codes, points)
+            result = self.occupancy(codes, points, settings.kernel)
             occupancy.view(-1)[flat] = result.whole
             soft.view(-1, soft.shape[-1])[flat] = result.soft_parts
             found.append(replace(result.items, points=flat[result.items.points]))
@@ -481,6 +506,26 @@ class HandAvatar(nn.Module):
                 flat[name] = flat[name].index_copy(0, edge, mean)
         channels = {name: values.unflatten(0, size) for name, values in flat.items()}
         return Rendering(**channels)
+
+    def render_batch(
+        self,
+        poses: Sequence[HandPose],
+        cameras: Sequence[Camera],
+        edit: Edit | None = None,
+        settings: RenderSettings | None = None,
+    ) -> list[Rendering]:
+        """The pictures that :meth:`render` makes one by one; on a CPU side by side, a thread each.
+
+        Raises:
+            ValueError: if there are not as many cameras as poses.
+        """
+        if len(poses) != len(cameras):
+            raise ValueError(
+                f"render_batch: found {len(poses)} poses and {len(cameras)} cameras, expected as "
+                "many of both"
+            )
+        views = zip(poses, cameras, strict=True)
+        return mapped(lambda view: self.render(*view, edit, settings), views)
 
     def at_pixels(
         self,

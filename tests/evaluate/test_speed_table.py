@@ -23,14 +23,17 @@ def options(
 ) -> SpeedTableOptions:
     path = tmp_path_factory.mktemp("speed") / "avatar.safetensors"
     small_avatar.save(path)
-    return SpeedTableOptions(path, size=16, poses=2, plain_rays=40, plain_points=(512,), sizes=(8,))
+    return SpeedTableOptions(
+        path, size=16, poses=2, plain_rays=40, plain_points=(512,), sizes=(8,), hands=(3,)
+    )
 
 
 def test_the_ways_are_timed_on_the_same_pictures(options: SpeedTableOptions) -> None:
     told: list[int] = []
     table = speed_table(options, told.append)
     assert list(table.rows) == [
-        *("plain", "exact", "near-exact", "exact, 8 pixels", "near-exact, 8 pixels")
+        *("plain", "exact", "near-exact", "exact, 3 hands", "near-exact, 3 hands"),
+        *("exact, 8 pixels", "near-exact, 8 pixels"),
     ]
     exact, near = table.rows["exact"], table.rows["near-exact"]
     assert isinstance(exact["max error"], float) and exact["max error"] < 5e-5
@@ -40,7 +43,7 @@ def test_the_ways_are_timed_on_the_same_pictures(options: SpeedTableOptions) -> 
     assert told[-1] == options.total_steps
     assert json.loads(json.dumps(table.record(), allow_nan=False)) is not None
     shown = table.markdown()
-    assert "2 poses of 16x16 pixels" in shown
+    assert "2 poses of 16x16 pixels" in shown and "ms a hand" in shown
     memory = table.rows["exact, 8 pixels"]["MB at most"]
     assert isinstance(memory, int) and 100 < memory < 2000
 

@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,14 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils.flop_counter import FlopCounterMode
 
-from handavatar.avatar import EXACT, HandAvatar, HandState, RayValues, RenderSettings
+from handavatar.avatar import (
+    EXACT,
+    HandAvatar,
+    HandState,
+    RayValues,
+    RenderSettings,
+    chosen_device,
+)
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.geometry.cameras import (
     Camera,
@@ -31,7 +40,7 @@ from handavatar.geometry.cameras import (
     pixel_centers,
     rays_through_pixels,
 )
-from handavatar.hand.pose import HandPose
+from handavatar.hand.pose import BONE_PARENTS, NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import GESTURES, gesture_rotations
 from handavatar.plain import plain_rays
 
@@ -40,12 +49,23 @@ _WAYS = {
     "near-exact": RenderSettings(edge_rays=1),
 }
 """As ``render --quality`` has them, but with one ray a pixel like the reference."""
+_KERNEL_WAYS = {
+    "exact, triton": replace(_WAYS["exact"], kernel="triton"),
+    "near-exact, triton": replace(_WAYS["near-exact"], kernel="triton"),
+    "near-exact, triton-tf32": replace(_WAYS["near-exact"], kernel="triton-tf32"),
+    "near-exact, triton-bf16": replace(_WAYS["near-exact"], kernel="triton-bf16"),
+}
+"""The same with the kernels of :mod:`handavatar.field.fused`, where there is a GPU."""
 _VIEWS = ((0.0, -1.0, 0.0), (0.0, 1.0, 0.0), (0.0, -0.7, 0.7), (0.0, 0.7, 0.7))
 """Where the camera stands, in turn: palm, back and two sides, in the hand's rest axes."""
 _DISTANCE = 0.6
 _ROOM = 1.3
 """The picture's side for a hand's side, as in the authors' crops."""
 _COUNTED_RAYS = 64
+
+
+def _ways(device: torch.device) -> dict[str, RenderSettings]:
+    return _WAYS | (_KERNEL_WAYS if device.type == "cuda" else {})
 
 
 @dataclass(frozen=True)
@@ -59,6 +79,9 @@ class SpeedTableOptions:
         plain_rays: rays of each picture that the plain reference evaluates.
         plain_points: points at a time of the plain reference; the best of these counts.
         sizes: pixels along a side, of one pose, by the fast ways alone.
+        hands: numbers of hands rendered as one batch, by the fast ways alone.
+        device: where the fields run; on a GPU the kernels of the pair decoder are rows of their
+            own.
     """
 
     avatar: Path
@@ -67,11 +90,14 @@ class SpeedTableOptions:
     plain_rays: int = 512
     plain_points: tuple[int, ...] = (512, 1024, 2048)
     sizes: tuple[int, ...] = (64, 128, 256, 512)
+    hands: tuple[int, ...] = (1, 2, 4, 8)
+    device: str = "auto"
 
     @property
     def total_steps(self) -> int:
         """Pictures and the choice of the reference's pieces."""
-        return self.poses + len(self.plain_points) + len(_WAYS) * len(self.sizes)
+        alone = len(_ways(chosen_device(self.device))) * (len(self.sizes) + len(self.hands))
+        return self.poses + len(self.plain_points) + alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +138,9 @@ def speed_table(
         raise ValueError(
             f"--plain-rays: found {options.plain_rays}, expected 1 to {options.size**2}"
         )
-    avatar = HandAvatar.load(options.avatar)
+    device = chosen_device(options.device)
+    ways = _ways(device)
+    avatar = HandAvatar.load(options.avatar).moved_to(device)
     finished = step_counter(report)
     with torch.no_grad():
         scenes = [
@@ -120,29 +148,32 @@ def speed_table(
             for number, name in enumerate(list(GESTURES)[: options.poses])
         ]
         points_at_once = _best_pieces(avatar, scenes[0], options, finished)
-        timings = {name: Timings() for name in ("plain", *_WAYS)}
+        timings = {name: Timings() for name in ("plain", *ways)}
         for scene in scenes:
-            _time_scene(avatar, scene, points_at_once, timings)
+            _time_scene(avatar, scene, points_at_once, ways, timings)
             finished()
         counts = _counts(avatar, scenes[0], points_at_once)
-        peak = _peak_flops()
+        peak = _peak_flops(device)
         rows = {
-            name: _row(timing, timings["plain"], counts[name], peak)
+            # A kernel does the work of the operations that it replaces.
+            name: _row(timing, timings["plain"], counts[name.partition(",")[0]], peak)
             for name, timing in timings.items()
         }
+        for name, settings in ways.items():
+            for count in options.hands:
+                spent = _batch_seconds(avatar, scenes, count, settings)
+                rows[f"{name}, {count} hands"] = _short_row(rows["plain"], spent / count)
+                finished()
+        skinning = _skinning_note(avatar)
     empty = 0.0
-    for size in options.sizes:
-        for name in _WAYS:
-            spent, empty, memory = _alone(options.avatar, name, size)
-            rows[f"{name}, {size} pixels"] = {
-                **dict.fromkeys(rows["plain"]),
-                "s a picture": round(spent, 3),
-                "MB at most": round(memory),
-            }
+    for name in ways:
+        for size in options.sizes:
+            spent, empty, memory = _alone(options.avatar, device, name, size)
+            rows[f"{name}, {size} pixels"] = _short_row(rows["plain"], spent, memory)
             finished()
     notes = (
-        f"{len(scenes)} poses of {options.size}x{options.size} pixels, {torch.get_num_threads()} "
-        f"threads; the plain reference on {options.plain_rays} rays of each, scaled to all, "
+        f"{len(scenes)} poses of {options.size}x{options.size} pixels, {_machine(device)}; the "
+        f"plain reference on {options.plain_rays} rays of each, scaled to all, "
         f"{points_at_once} points at a time (the best of {list(options.plain_points)}).",
         "Ratio: seconds of the plain reference for all poses over those of the row [least, most of "
         "a single pose]. Errors: of the colour at the reference's rays, at the same places along "
@@ -150,8 +181,11 @@ def speed_table(
         f"TFLOP of matrix products and GB through memory, every operation's operands and result, "
         f"of the first pose; this machine reaches {peak / 1e9:,.0f} GFLOP/s in a product of two "
         "2048x2048 matrices.",
+        f"Hands: seconds for each of so many poses of {options.size}x{options.size} pixels, "
+        "rendered as one batch.",
         "By size of the picture: the first pose in a process of its own; MB: the most that the "
         f"process held, of which {empty:.0f} before the picture was begun.",
+        skinning,
     )
     return ResultTable("Speed of rendering", rows, notes)
 
@@ -167,11 +201,13 @@ def hand_camera(
 
 
 def _scene(avatar: HandAvatar, gesture: str, number: int, size: int, num_rays: int) -> Scene:
-    pose = HandPose(gesture_rotations(avatar.base_rig, gesture), torch.zeros(3))
+    rotations = gesture_rotations(avatar.base_rig, gesture).to(avatar.device)
+    pose = HandPose(rotations, rotations.new_zeros(3))
     state = avatar.prepare(pose)
     camera = hand_camera(state.posed.vertices, _VIEWS[number % len(_VIEWS)], size)
+    camera = camera.to(avatar.device)
     generator = torch.Generator().manual_seed(number)
-    pixels = torch.randperm(size**2, generator=generator)[:num_rays]
+    pixels = torch.randperm(size**2, generator=generator)[:num_rays].to(avatar.device)
     rays = rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1)[pixels])
     return Scene(pose, camera, state, pixels, rays)
 
@@ -181,6 +217,19 @@ def _first_rays(scene: Scene) -> Rays:
 
 
 # --- timing ---------------------------------------------------------------------------------------
+
+
+def _now(device: torch.device) -> float:
+    """Seconds, once all that was asked of the device is done."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def _machine(device: torch.device) -> str:
+    if device.type == "cuda":
+        return torch.cuda.get_device_name(device)
+    return f"{torch.get_num_threads()} threads"
 
 
 class Timings:
@@ -212,29 +261,36 @@ def _best_pieces(
     few = _first_rays(scene)
     spent = {}
     for count in options.plain_points:
-        begin = time.perf_counter()
+        begin = _now(avatar.device)
         plain_rays(avatar, scene.state, few, points_at_once=count)
-        spent[count] = time.perf_counter() - begin
+        spent[count] = _now(avatar.device) - begin
         finished()
     return min(spent, key=spent.__getitem__)
 
 
 def _time_scene(
-    avatar: HandAvatar, scene: Scene, points_at_once: int, timings: dict[str, Timings]
+    avatar: HandAvatar,
+    scene: Scene,
+    points_at_once: int,
+    ways: dict[str, RenderSettings],
+    timings: dict[str, Timings],
 ) -> None:
     """One picture in each way, one after the other, so that all meet the same machine."""
     scale = scene.camera.width * scene.camera.height / len(scene.pixels)
     with _stages(avatar) as stages:
-        begin = time.perf_counter()
+        begin = _now(avatar.device)
         truth = plain_rays(avatar, scene.state, scene.rays, points_at_once=points_at_once)
-        seconds = scale * (time.perf_counter() - begin)
+        seconds = scale * (_now(avatar.device) - begin)
         spent = {name: scale * value for name, value in stages.items()}
     timings["plain"].add(seconds, truth, truth, spent)
-    for name, settings in _WAYS.items():
-        with _stages(avatar) as stages:
-            begin = time.perf_counter()
+    for name, settings in ways.items():
+        if timings[name].seconds == [] and avatar.device.type == "cuda":
+            # The first time a GPU's kernels are compiled and loaded.
             avatar.render(scene.pose, scene.camera, settings=settings)
-            seconds = time.perf_counter() - begin
+        with _stages(avatar) as stages:
+            begin = _now(avatar.device)
+            avatar.render(scene.pose, scene.camera, settings=settings)
+            seconds = _now(avatar.device) - begin
         found = avatar.at_pixels(scene.state, scene.camera, scene.pixels, settings)
         timings[name].add(seconds, found, truth, dict(stages))
 
@@ -257,10 +313,10 @@ def _stages(avatar: HandAvatar) -> Iterator[dict[str, float]]:
     for name, module in fields.items():
 
         def before(*_: Any) -> None:
-            begun.append(time.perf_counter())
+            begun.append(_now(avatar.device))
 
         def after(*_: Any, name: str = name.removeprefix("plain ")) -> None:
-            spent[name] = spent.get(name, 0.0) + time.perf_counter() - begun.pop()
+            spent[name] = spent.get(name, 0.0) + _now(avatar.device) - begun.pop()
 
         handles += [
             module.register_forward_pre_hook(before),
@@ -273,27 +329,47 @@ def _stages(avatar: HandAvatar) -> Iterator[dict[str, float]]:
             handle.remove()
 
 
-def _alone(path: Path, way: str, size: int) -> tuple[float, float, float]:
+def _batch_seconds(
+    avatar: HandAvatar, scenes: list[Scene], count: int, settings: RenderSettings
+) -> float:
+    """Seconds for so many hands at once; where there are more than poses, poses come again."""
+    chosen = [scenes[number % len(scenes)] for number in range(count)]
+    begin = _now(avatar.device)
+    avatar.render_batch(
+        [scene.pose for scene in chosen], [scene.camera for scene in chosen], settings=settings
+    )
+    return _now(avatar.device) - begin
+
+
+def _alone(path: Path, device: torch.device, way: str, size: int) -> tuple[float, float, float]:
     """One picture in a process of its own: seconds, and the most memory before and with it, MB."""
     # Spawned, not forked: a fork would start with this process's memory.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(1, mp_context=context) as pool:
-        return pool.submit(_rendered_alone, path, way, size, torch.get_num_threads()).result()
+        threads = torch.get_num_threads()
+        return pool.submit(_rendered_alone, path, device, way, size, threads).result()
 
 
-def _rendered_alone(path: Path, way: str, size: int, threads: int) -> tuple[float, float, float]:
+def _rendered_alone(
+    path: Path, device: torch.device, way: str, size: int, threads: int
+) -> tuple[float, float, float]:
     torch.set_num_threads(threads)
-    avatar = HandAvatar.load(path)
+    settings = _ways(device)[way]
+    avatar = HandAvatar.load(path).moved_to(device)
     with torch.no_grad():
         scene = _scene(avatar, next(iter(GESTURES)), 0, size, 1)
-    before = _most_memory()
-    begin = time.perf_counter()
-    avatar.render(scene.pose, scene.camera, settings=_WAYS[way])
-    return time.perf_counter() - begin, before, _most_memory()
+    before = _most_memory(device)
+    if device.type == "cuda":
+        avatar.render(scene.pose, scene.camera, settings=settings)
+    begin = _now(device)
+    avatar.render(scene.pose, scene.camera, settings=settings)
+    return _now(device) - begin, before, _most_memory(device)
 
 
-def _most_memory() -> float:
-    """The most that this process has held so far, megabytes."""
+def _most_memory(device: torch.device) -> float:
+    """The most that this process has held so far on its device, megabytes."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 1e6
     # Told in kilobytes, but in bytes on a Mac.
     unit = 1e6 if sys.platform == "darwin" else 1e3
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
@@ -357,14 +433,14 @@ def counted(work: Callable[[], None]) -> tuple[int, int]:
     return flops.get_total_flops(), traffic.total
 
 
-def _peak_flops(size: int = 2048, tries: int = 3) -> float:
+def _peak_flops(device: torch.device, size: int = 2048, tries: int = 3) -> float:
     """Operations a second of a large product of 32-bit matrices, the best of some tries."""
-    left, right = torch.rand(size, size), torch.rand(size, size)
+    left, right = torch.rand(2, size, size, device=device)
     spent = []
     for _ in range(tries):
-        begin = time.perf_counter()
+        begin = _now(device)
         left @ right
-        spent.append(time.perf_counter() - begin)
+        spent.append(_now(device) - begin)
     return 2 * size**3 / min(spent)
 
 
@@ -389,3 +465,54 @@ def _row(
     row["MB at most"] = None
     row["% of peak"] = round(100 * counts[0] / timing.seconds[0] / peak, 1)
     return row
+
+
+def _short_row(
+    like: dict[str, Cell], seconds: float, memory: float | None = None
+) -> dict[str, Cell]:
+    """A row that only says how long a picture took, and how much memory."""
+    return {
+        **dict.fromkeys(like),
+        "s a picture": round(seconds, 3),
+        "MB at most": None if memory is None else round(memory),
+    }
+
+
+def _skinning_note(avatar: HandAvatar, hands: int = 16) -> str:
+    """How long it takes to shape and pose a mesh, for us and for smplx, if that is installed."""
+    rig = avatar.base_rig
+    generator = torch.Generator().manual_seed(0)
+    rotations = 0.3 * torch.randn(hands, NUM_BONES, 3, generator=generator).to(avatar.device)
+    shapes = torch.randn(hands, rig.shape_directions.shape[-1], generator=generator)
+    shapes = shapes.to(avatar.device)
+    pose = HandPose(rotations, rotations.new_zeros(hands, 3))
+    ours = _best_seconds(lambda: rig.shaped(shapes).posed(pose), avatar.device)
+    told = f"Shaping and posing {rig.num_vertices} vertices: {1e3 * ours / hands:.2f} ms a hand"
+    if find_spec("smplx") is None:
+        return f"{told} in batches of {hands}; smplx is not installed."
+    lbs = import_module("smplx.lbs").lbs
+    # Multiplied by smplx in any case; the open hand has none.
+    no_directions = shapes.new_zeros(9 * (NUM_BONES - 1), 3 * rig.num_vertices)
+    theirs = _best_seconds(
+        lambda: lbs(
+            shapes,
+            rotations.flatten(1),
+            rig.template_vertices,
+            rig.shape_directions,
+            no_directions,
+            rig.joint_regressor,
+            torch.tensor(BONE_PARENTS).to(avatar.device),
+            rig.skin_weights,
+        ),
+        avatar.device,
+    )
+    return f"{told}, smplx {1e3 * theirs / hands:.2f} ms, in batches of {hands}."
+
+
+def _best_seconds(work: Callable[[], Any], device: torch.device, tries: int = 5) -> float:
+    spent = []
+    for _ in range(tries):
+        begin = _now(device)
+        work()
+        spent.append(_now(device) - begin)
+    return min(spent)

@@ -11,6 +11,7 @@ hold the point, shares first layers between pairs, and is fast.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -22,6 +23,9 @@ from handavatar.hand.parts import PartBoxes, Parts
 from handavatar.hand.pose import CONNECTED_PAIRS, NUM_BONES
 from handavatar.hand.rig import PosedHand
 
+if TYPE_CHECKING:
+    from handavatar.field.fused import PackedWeights
+
 CODE_WIDTH = 64
 LENGTH_SCALE = 20.0
 """Bone-frame metres are multiplied by this before any network sees them (5 cm become 1)."""
@@ -29,6 +33,11 @@ LOGIT_SCALE = 10.0
 """The decoder's output is multiplied by this: a surface needs logits of some units per mm."""
 BOX_MARGIN = 0.012
 """How far a part's box reaches beyond the part, metres."""
+
+Precision = Literal["ieee", "tf32", "bf16"]
+"""Of the factors of matrix products; sums and everything else have 32 bits."""
+Kernel = Literal["torch", "triton", "triton-tf32", "triton-bf16"]
+"""What decodes pairs without gradient: torch's operations, or kernels for NVIDIA GPUs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,19 +253,22 @@ class PairOccupancy(nn.Module):
         self.chunk = chunk
         self.connections = connections
         self.sharpness = sharpness
+        self._packed: tuple[tuple[object, ...], PackedWeights] | None = None
         self.register_buffer("pairs", torch.tensor(connections), persistent=False)
 
     def encode(self, parts: Parts, posed: PosedHand) -> HandCodes:
         """Encodes the surface of a posed hand; once per pose."""
         return hand_codes(self.encoder.factorised, parts, posed, self.margin)
 
-    def forward(self, codes: HandCodes, points: Float[Tensor, "points 3"]) -> Occupancy:
+    def forward(
+        self, codes: HandCodes, points: Float[Tensor, "points 3"], kernel: Kernel = "torch"
+    ) -> Occupancy:
         """Occupancy at world points (metres), without gradient; the fast way."""
         # A core's cache wants small pieces; a GPU wants large ones, one after the other.
         chunk = self.chunk if points.device.type == "cpu" else 128 * self.chunk
         starts = range(0, max(len(points), 1), chunk)
         chunks = [points[start : start + chunk] for start in starts]
-        pieces = mapped(lambda piece: self._chunk_occupancy(codes, piece), chunks)
+        pieces = mapped(lambda piece: self._chunk_occupancy(codes, piece, kernel), chunks)
         items = PairItems(
             torch.cat([p.items.points + start for p, start in zip(pieces, starts, strict=True)]),
             torch.cat([p.items.pairs for p in pieces]),
@@ -347,37 +359,27 @@ class PairOccupancy(nn.Module):
         answers = last.of_set(tokens[items.is_wanted][:, None], tokens.amax(-2)[item])[:, 0]
         return LOGIT_SCALE * self.decoder.mlp(network.output(answers.relu()))[:, 0]
 
-    def _chunk_occupancy(self, codes: HandCodes, points: Float[Tensor, "points 3"]) -> Occupancy:
+    def _chunk_occupancy(
+        self, codes: HandCodes, points: Float[Tensor, "points 3"], kernel: Kernel
+    ) -> Occupancy:
         """The fast evaluation: the same function as :meth:`plain`, by exact algebra.
 
-        Only pairs with a box that holds the point are decoded; the constant part code enters
-        the first layer as a bias; the first block runs once per part instead of once per pair;
-        the pooled half of every later block runs once per pair instead of once per member; the
-        last block and the MLP run for wanted answers only.
+        Only pairs with a box that holds the point are decoded.
         """
         num_points = len(points)
         local = local_points(codes.boxes, points)
         is_in_box = contains(codes.boxes, local)
         first, second = self.pairs.unbind(-1)
-        is_active = is_in_box[:, first] | is_in_box[:, second]
-        pair_index, point_index = is_active.T.nonzero().unbind(-1)
-        is_needed = torch.zeros_like(is_in_box)
-        for column, (a, b) in enumerate(self.connections):
-            is_needed[:, a] |= is_active[:, column]
-            is_needed[:, b] |= is_active[:, column]
-        features, row_of = self._part_features(codes, local, is_needed)
-
+        pair_index, point_index = (is_in_box[:, first] | is_in_box[:, second]).T.nonzero().T
         members = self.pairs[pair_index]
-        rows = row_of[members, point_index[:, None]]
-        tokens = features[rows]
-        *between, last = self.decoder.pointnet.set_blocks
-        for block in between:
-            tokens = block.of_set(tokens, tokens.amax(1))
         is_wanted = is_in_box[point_index[:, None], members]
-        item_of_answer = is_wanted.nonzero()[:, 0]
-        answers = last.of_set(tokens[is_wanted][:, None], tokens.amax(1)[item_of_answer])[:, 0]
-        answers = self.decoder.pointnet.output(answers.relu_())
-        logits = LOGIT_SCALE * self.decoder.mlp(answers)[:, 0]
+        items = PairItems(point_index, pair_index, is_wanted)
+        item_of_answer, side = is_wanted.nonzero().unbind(-1)
+        if kernel == "torch":
+            logits = self._item_logits(codes, local, items, item_of_answer)
+        else:
+            precision = cast(Precision, kernel.partition("-")[2] or "ieee")
+            logits = self._fused_logits(codes, points, items, item_of_answer, side, precision)
 
         answer_points = point_index[item_of_answer]
         slots = answer_points * NUM_BONES + members[is_wanted]
@@ -387,13 +389,70 @@ class PairOccupancy(nn.Module):
         )
         soft = self.fusion.over_pairs(logits, slots, size, self.softness).view(-1, NUM_BONES)
         deciding = self.fusion.deciding(logits, answer_points, num_points)
-        side = is_wanted.nonzero()[:, 1][deciding]
         items = PairItems(
             answer_points[deciding],
             pair_index[item_of_answer[deciding]],
-            torch.nn.functional.one_hot(side, 2).bool(),
+            torch.nn.functional.one_hot(side[deciding], 2).bool(),
         )
         return Occupancy(self.fusion.over_parts(parts), soft * box_fade(local, codes.boxes), items)
+
+    def _item_logits(
+        self,
+        codes: HandCodes,
+        local: Float[Tensor, "points bones 3"],
+        items: PairItems,
+        item_of_answer: Int[Tensor, "answers"],
+    ) -> Float[Tensor, "answers"]:
+        """The wanted answers of the given pairs, with torch's operations.
+
+        The constant part code enters the first layer as a bias; the first block runs once per
+        part instead of once per pair; the pooled half of every later block runs once per pair
+        instead of once per member; the last block and the MLP run for wanted answers only.
+        """
+        members = self.pairs[items.pairs]
+        is_needed = torch.zeros_like(local[..., 0], dtype=torch.bool)
+        is_needed[items.points[:, None], members] = True
+        features, row_of = self._part_features(codes, local, is_needed)
+        tokens = features[row_of[members, items.points[:, None]]]
+        *between, last = self.decoder.pointnet.set_blocks
+        for block in between:
+            tokens = block.of_set(tokens, tokens.amax(1))
+        own, pooled = tokens[items.is_wanted], tokens.amax(1)[item_of_answer]
+        answers = last.of_set(own[:, None], pooled)[:, 0]
+        answers = self.decoder.pointnet.output(answers.relu_())
+        return LOGIT_SCALE * self.decoder.mlp(answers)[:, 0]
+
+    def _fused_logits(
+        self,
+        codes: HandCodes,
+        points: Float[Tensor, "points 3"],
+        items: PairItems,
+        item_of_answer: Int[Tensor, "answers"],
+        side: Int[Tensor, "answers"],
+        precision: Precision,
+    ) -> Float[Tensor, "answers"]:
+        """The same by the kernels of :mod:`handavatar.field.fused`."""
+        from handavatar.field import fused
+
+        network, mlp = self.decoder.pointnet, self.decoder.mlp
+        # Weights that a step has changed, or that were moved, are packed anew.
+        state = tuple((weight.data_ptr(), weight._version) for weight in self.decoder.parameters())
+        if self._packed is None or self._packed[0] != (precision, state):
+            packed = fused.pack_weights(network, mlp, precision, LENGTH_SCALE, LOGIT_SCALE)
+            self._packed = (precision, state), packed
+        weights = self._packed[1]
+        return fused.fused_logits(
+            weights,
+            codes.part_codes @ weights.of_code.T + network.input.bias,
+            codes.boxes.bone_from_world,
+            self.pairs,
+            points,
+            items.points,
+            items.pairs,
+            item_of_answer,
+            side,
+            precision,
+        )
 
     def _part_features(
         self,

@@ -1,0 +1,305 @@
+"""The pair decoder in two Triton kernels, for NVIDIA GPUs: what lies between stays on the chip.
+
+Optional: Triton comes with torch's CUDA builds and is imported here alone. The kernels compute
+what ``PairOccupancy._item_logits`` computes with torch's operations, without gradient: a *trunk*
+for every pair that has a point, up to the last block of its PointNet, and *answers*, the last block
+and the MLP, for those of the two parts that were asked. Weights come from one buffer, in the order
+in which the layers need them.
+
+Without a GPU the kernels run in Triton's interpreter (``TRITON_INTERPRET=1``), slowly: for tests.
+"""
+
+import math
+import os
+from dataclasses import dataclass
+from typing import Any, cast
+
+import torch
+import triton
+import triton.language as tl
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from handavatar.field.layers import PointNet, ResidualBlock, SkipMLP
+from handavatar.field.occupancy import Precision
+
+_BLOCK = 64
+"""Items at a time in one program."""
+_IS_INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+
+
+@dataclass(frozen=True, eq=False)
+class PackedWeights:
+    """A decoder's weights as the kernels read them, layer after layer.
+
+    Attributes:
+        matrices: of the trunk, then of the answers; inputs times outputs each.
+        vectors: the position's rows of the first layer, then all biases.
+        of_code: the code's part of the first layer.
+        num_trunk_matrices: entries of ``matrices`` that belong to the trunk.
+        num_trunk_vectors: entries of ``vectors`` that do.
+    """
+
+    matrices: Float[Tensor, "entries"]
+    vectors: Float[Tensor, "rows"]
+    of_code: Float[Tensor, "128 64"]
+    num_trunk_matrices: int
+    num_trunk_vectors: int
+
+
+@triton.jit
+def _product(values, matrix, PRECISION: tl.constexpr, IS_INTERPRETED: tl.constexpr):
+    if PRECISION == "bf16":
+        rounded = values.to(tl.bfloat16)
+        if IS_INTERPRETED:
+            # The interpreter's product of two bfloat16 is wrong; this is the same number.
+            return tl.dot(rounded.to(tl.float32), matrix.to(tl.float32), input_precision="ieee")
+        return tl.dot(rounded, matrix)
+    return tl.dot(values, matrix, input_precision=PRECISION)
+
+
+@triton.jit
+def _matrix(pointer, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    rows, columns = tl.arange(0, ROWS), tl.arange(0, COLUMNS)
+    return tl.load(pointer + rows[:, None] * COLUMNS + columns[None, :])
+
+
+@triton.jit
+def _vector(pointer, SIZE: tl.constexpr):
+    return tl.load(pointer + tl.arange(0, SIZE))[None, :]
+
+
+@triton.jit
+def _opened(
+    members, x, y, z, transforms, code_biases, matrices, vectors,
+    PRECISION: tl.constexpr, IS_INTERPRETED: tl.constexpr,
+):  # fmt: skip
+    """First layer and first block of one part: its code is a bias, its frame an affine map."""
+    row = transforms + 12 * members
+    hidden = tl.load(code_biases + members[:, None] * 128 + tl.arange(0, 128)[None, :])
+    for axis in tl.static_range(3):
+        place = (
+            tl.load(row + 4 * axis) * x
+            + tl.load(row + 4 * axis + 1) * y
+            + tl.load(row + 4 * axis + 2) * z
+            + tl.load(row + 4 * axis + 3)
+        )
+        hidden += place[:, None] * _vector(vectors + 128 * axis, 128)
+    inner = _product(
+        tl.maximum(hidden, 0.0), _matrix(matrices, 128, 64), PRECISION, IS_INTERPRETED
+    ) + _vector(vectors + 384, 64)
+    outer = _product(
+        tl.maximum(inner, 0.0), _matrix(matrices + 8192, 64, 64), PRECISION, IS_INTERPRETED
+    ) + _vector(vectors + 448, 64)
+    shortcut = _matrix(matrices + 12288, 128, 64)
+    return outer + _product(hidden, shortcut, PRECISION, IS_INTERPRETED)
+
+
+@triton.jit
+def _common(pooled, matrices, vectors, PRECISION: tl.constexpr, IS_INTERPRETED: tl.constexpr):
+    """What the two parts of a pair share in a block: of the hidden layer, and of the output."""
+    hidden = _product(
+        tl.maximum(pooled, 0.0), _matrix(matrices, 64, 64), PRECISION, IS_INTERPRETED
+    ) + _vector(vectors, 64)
+    out = _product(pooled, _matrix(matrices + 4096, 64, 64), PRECISION, IS_INTERPRETED) + _vector(
+        vectors + 64, 64
+    )
+    return hidden, out
+
+
+@triton.jit
+def _own(values, hidden, out, matrices, PRECISION: tl.constexpr, IS_INTERPRETED: tl.constexpr):
+    """A block for one part, given what it shares with the other."""
+    hidden += _product(
+        tl.maximum(values, 0.0), _matrix(matrices + 8192, 64, 64), PRECISION, IS_INTERPRETED
+    )
+    out += _product(
+        tl.maximum(hidden, 0.0), _matrix(matrices + 12288, 64, 64), PRECISION, IS_INTERPRETED
+    )
+    return out + _product(values, _matrix(matrices + 16384, 64, 64), PRECISION, IS_INTERPRETED)
+
+
+@triton.jit
+def _trunk(
+    points, point_of, pair_of, pairs, transforms, code_biases, matrices, vectors, tokens, count,
+    BLOCK: tl.constexpr, PRECISION: tl.constexpr, IS_INTERPRETED: tl.constexpr,
+):  # fmt: skip
+    item = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    is_item = item < count
+    point = points + 3 * tl.load(point_of + item, mask=is_item, other=0)
+    x, y, z = tl.load(point), tl.load(point + 1), tl.load(point + 2)
+    pair = pairs + 2 * tl.load(pair_of + item, mask=is_item, other=0)
+    first = _opened(
+        tl.load(pair), x, y, z, transforms, code_biases, matrices, vectors,
+        PRECISION, IS_INTERPRETED,
+    )  # fmt: skip
+    second = _opened(
+        tl.load(pair + 1), x, y, z, transforms, code_biases, matrices, vectors,
+        PRECISION, IS_INTERPRETED,
+    )  # fmt: skip
+    matrices += 20480
+    vectors += 512
+    for _ in tl.static_range(2):
+        hidden, out = _common(
+            tl.maximum(first, second), matrices, vectors, PRECISION, IS_INTERPRETED
+        )
+        first = _own(first, hidden, out, matrices, PRECISION, IS_INTERPRETED)
+        second = _own(second, hidden, out, matrices, PRECISION, IS_INTERPRETED)
+        matrices += 20480
+        vectors += 128
+    place = tokens + 128 * item[:, None] + tl.arange(0, 64)[None, :]
+    tl.store(place, first, mask=is_item[:, None])
+    tl.store(place + 64, second, mask=is_item[:, None])
+
+
+@triton.jit
+def _answers(
+    tokens, item_of, side_of, matrices, vectors, logits, count,
+    BLOCK: tl.constexpr, PRECISION: tl.constexpr, IS_INTERPRETED: tl.constexpr,
+):  # fmt: skip
+    answer = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    is_answer = answer < count
+    item = tl.load(item_of + answer, mask=is_answer, other=0)
+    side = tl.load(side_of + answer, mask=is_answer, other=0)
+    place = tokens + (128 * item)[:, None] + tl.arange(0, 64)[None, :]
+    own = tl.load(place + (64 * side)[:, None])
+    other = tl.load(place + (64 - 64 * side)[:, None])
+    hidden, out = _common(tl.maximum(own, other), matrices, vectors, PRECISION, IS_INTERPRETED)
+    values = tl.maximum(_own(own, hidden, out, matrices, PRECISION, IS_INTERPRETED), 0.0)
+    matrices += 20480
+    vectors += 128
+    features = _product(values, _matrix(matrices, 64, 64), PRECISION, IS_INTERPRETED) + _vector(
+        vectors, 64
+    )
+    matrices += 4096
+    vectors += 64
+    first = _product(features, _matrix(matrices, 64, 128), PRECISION, IS_INTERPRETED) + _vector(
+        vectors, 128
+    )
+    second = _product(
+        tl.maximum(first, 0.0), _matrix(matrices + 8192, 128, 64), PRECISION, IS_INTERPRETED
+    ) + _vector(vectors + 128, 64)
+    third = (
+        _product(
+            tl.maximum(second, 0.0), _matrix(matrices + 16384, 64, 128), PRECISION, IS_INTERPRETED
+        )
+        + _product(features, _matrix(matrices + 24576, 64, 128), PRECISION, IS_INTERPRETED)
+        + _vector(vectors + 192, 128)
+    )
+    fourth = _product(
+        tl.maximum(third, 0.0), _matrix(matrices + 32768, 128, 128), PRECISION, IS_INTERPRETED
+    ) + _vector(vectors + 320, 128)
+    logit = tl.sum(tl.maximum(fourth, 0.0) * _vector(vectors + 448, 128), axis=1)
+    tl.store(logits + answer, logit + tl.load(vectors + 576), mask=is_answer)
+
+
+def pack_weights(
+    pointnet: PointNet, mlp: SkipMLP, precision: Precision, length_scale: float, logit_scale: float
+) -> PackedWeights:
+    """A decoder's weights in the kernels' order, scales included.
+
+    Args:
+        pointnet: the decoder's, of codes and positions.
+        mlp: what turns its features into a logit.
+        precision: ``bf16`` rounds the matrices.
+        length_scale: what positions in metres are multiplied by.
+        logit_scale: what the logit is multiplied by.
+    """
+    width = pointnet.output.out_features
+    of_code, of_place = pointnet.input.weight.detach().split((width, 3), dim=1)
+    opening, *between, last = cast(list[ResidualBlock], list(pointnet.blocks))
+    trunk = [opening.inner.weight.T, opening.outer.weight.T, opening.shortcut.weight.T]
+    trunk += [part for block in between for part in _shared_first(block, width)]
+    first, second, third, fourth = cast(list[nn.Linear], list(mlp.layers))
+    joined = (third.weight / math.sqrt(2)).split(width, dim=1)
+    answers = [*_shared_first(last, width), pointnet.output.weight.T, first.weight.T]
+    answers += [second.weight.T, joined[0].T, joined[1].T, fourth.weight.T]
+    trunk_vectors = [length_scale * of_place.T]
+    for block in (opening, *between):
+        trunk_vectors += [block.inner.bias, block.outer.bias]
+    layers = (last.inner, last.outer, pointnet.output, first, second, third, fourth)
+    vectors: list[Tensor] = [layer.bias for layer in layers]
+    vectors += [logit_scale * mlp.output.weight, logit_scale * mlp.output.bias]
+    return PackedWeights(
+        _flat(trunk + answers).to(torch.bfloat16 if precision == "bf16" else torch.float32),
+        _flat(trunk_vectors + vectors),
+        of_code,
+        sum(matrix.numel() for matrix in trunk),
+        sum(vector.numel() for vector in trunk_vectors),
+    )
+
+
+def fused_logits(
+    weights: PackedWeights,
+    code_biases: Float[Tensor, "bones 128"],
+    bone_from_world: Float[Tensor, "bones 4 4"],
+    pairs: Int[Tensor, "pairs 2"],
+    points: Float[Tensor, "points 3"],
+    item_points: Int[Tensor, "items"],
+    item_pairs: Int[Tensor, "items"],
+    answer_items: Int[Tensor, "answers"],
+    answer_sides: Int[Tensor, "answers"],
+    precision: Precision = "ieee",
+) -> Float[Tensor, "answers"]:
+    """Logits of the wanted answers, without gradient.
+
+    Args:
+        weights: packed with the same precision.
+        code_biases: the first layer of each part's code, bias included.
+        bone_from_world: frames of the parts, metres.
+        pairs: the two parts of each pair.
+        points: in the world, metres.
+        item_points: the point of each item.
+        item_pairs: its pair.
+        answer_items: the item of each answer.
+        answer_sides: 0 for the first part of its pair, 1 for the second.
+        precision: of the factors of matrix products; ``tf32`` and ``bf16`` are for looking, not
+            for pictures that must be exact.
+
+    Source: paper Sec. 3.2 and appendix (local-pair decoder).
+    """
+    num_items, num_answers = len(item_points), len(answer_items)
+    tokens = points.new_empty(num_items, 2, 64)
+    logits = points.new_empty(num_answers)
+    constants: dict[str, Any] = {
+        "BLOCK": _BLOCK,
+        "PRECISION": precision,
+        "IS_INTERPRETED": _IS_INTERPRETED,
+    }
+    if num_items:
+        _trunk[(triton.cdiv(num_items, _BLOCK),)](
+            points.contiguous(),
+            item_points.contiguous(),
+            item_pairs.contiguous(),
+            pairs.contiguous(),
+            bone_from_world[:, :3].contiguous(),
+            code_biases.contiguous(),
+            weights.matrices,
+            weights.vectors,
+            tokens,
+            num_items,
+            **constants,
+        )
+    if num_answers:
+        _answers[(triton.cdiv(num_answers, _BLOCK),)](
+            tokens,
+            answer_items.contiguous(),
+            answer_sides.contiguous(),
+            weights.matrices[weights.num_trunk_matrices :],
+            weights.vectors[weights.num_trunk_vectors :],
+            logits,
+            num_answers,
+            **constants,
+        )
+    return logits
+
+
+def _shared_first(block: ResidualBlock, width: int) -> list[Tensor]:
+    """Matrices of a block on a set: those of the pooled half first, then those of each point."""
+    own, common = block.inner.weight.split(width, dim=1)
+    own_shortcut, common_shortcut = block.shortcut.weight.split(width, dim=1)
+    return [common.T, common_shortcut.T, own.T, block.outer.weight.T, own_shortcut.T]
+
+
+def _flat(pieces: list[Tensor]) -> Float[Tensor, "entries"]:
+    return torch.cat([piece.detach().contiguous().flatten() for piece in pieces])
