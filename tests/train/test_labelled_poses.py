@@ -2,18 +2,16 @@
 
 import torch
 
-from handavatar.geometry.closest import closest_on_mesh
 from handavatar.geometry.meshes import distance_to_mesh, unique_edges
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import divide_into_parts
-from handavatar.hand.pose import HandPose
+from handavatar.hand.pose import CONNECTED_PAIRS, HandPose
 from handavatar.train.labelled_poses import (
-    JOINT_WEIGHT,
     LARGEST_OFFSET,
     LabelledPose,
     PoseStream,
+    joint_points,
     random_person,
-    training_points,
 )
 from handavatar.train.stage_times import StageTimes
 
@@ -78,18 +76,21 @@ def test_most_points_lie_near_the_surface_and_some_anywhere() -> None:
     assert float((distance[:51] > 0.002).float().mean()) > 0.6
 
 
-def test_points_at_joints_lie_where_several_bones_move_the_skin() -> None:
+def test_points_at_joints_lie_where_the_two_parts_of_their_pair_meet() -> None:
     posed = RIG.shaped().posed(HandPose(torch.zeros(16, 3), torch.zeros(3)))
+    points, pairs = joint_points(posed, 500, torch.Generator().manual_seed(0))
+    assert float(distance_to_mesh(posed.vertices, RIG.faces, points).median()) < 0.001
+    assert set(pairs.tolist()) == set(range(len(CONNECTED_PAIRS)))
+    near = (points[:, None] - posed.vertices).square().sum(-1).argmin(1)
+    weights = RIG.skin_weights[near].gather(1, torch.tensor(CONNECTED_PAIRS)[pairs])
+    assert float(weights.sum(1).mean()) > 0.8
+    assert float(weights.amin(1).mean()) > 0.2
 
-    def share_at_joints(joint_share: float) -> float:
-        generator = torch.Generator().manual_seed(0)
-        points = training_points(PARTS, posed, 4000, 0.012, generator, joint_share)
-        near = points[-3600:]
-        assert (distance_to_mesh(posed.sealed_vertices, RIG.sealed_faces, near) < 0.02).all()
-        corners = RIG.faces[closest_on_mesh(posed.vertices, RIG.faces, near).faces]
-        is_joint = RIG.skin_weights[corners].mean(1).amax(-1) < JOINT_WEIGHT
-        return float(is_joint.float().mean())
 
-    assert share_at_joints(0.0) < 0.35
-    assert share_at_joints(0.5) > 0.5
-    assert share_at_joints(1.0) > 0.75
+def test_points_at_joints_come_last_and_leave_the_others_as_they_are() -> None:
+    stream = PoseStream(RIG, RIG, PARTS, 0.012, 512, 0, joint_points=100)
+    plain, more = _drawn(3), stream.drawn(3, StageTimes())
+    assert len(plain.joint_pairs) == 0 and len(more.joint_pairs) == 100
+    assert torch.equal(more.points[:512], plain.points) and len(more.points) == 612
+    assert torch.equal(more.is_inside[:512], plain.is_inside)
+    assert 20 < int(more.is_inside[512:].sum()) < 80

@@ -294,7 +294,7 @@ class PairOccupancy(nn.Module):
         With the items that :meth:`forward` found to decide, value and gradient equal those of
         the full evaluation, at a fraction of the work.
         """
-        logits = self._wanted_logits(codes, points, items)
+        logits = self.wanted_logits(codes, points, items)
         slots = (items.points[:, None] * NUM_BONES + self.pairs[items.pairs])[items.is_wanted]
         parts = self.fusion.over_pairs(logits, slots, len(points) * NUM_BONES, slope=self.sharpness)
         return self.fusion.over_parts(parts.view(-1, NUM_BONES))
@@ -339,10 +339,10 @@ class PairOccupancy(nn.Module):
         queries = (transforms[..., :3, :3] @ position)[..., 0] + transforms[..., :3, 3]
         return members, queries * LENGTH_SCALE
 
-    def _wanted_logits(
+    def wanted_logits(
         self, codes: HandCodes, points: Float[Tensor, "points 3"], items: PairItems
     ) -> Float[Tensor, "wanted"]:
-        """The wanted answers of :meth:`_decode` with gradient, by exact algebra.
+        """The wanted answers of the given pairs, with gradient, by exact algebra.
 
         The constant part code enters the first layer as a bias; the pooled half of every later
         block runs once per pair; the last block and the MLP run for wanted answers only.

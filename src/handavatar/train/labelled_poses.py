@@ -5,7 +5,7 @@ so that several processes can share the work and a killed training can go on whe
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from handavatar.field.shape import personal_hand
 from handavatar.geometry.meshes import is_inside, sample_surface
 from handavatar.geometry.rotations import apply_rigid
 from handavatar.hand.parts import Parts
-from handavatar.hand.pose import NUM_BONES, HandPose
+from handavatar.hand.pose import CONNECTED_PAIRS, NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import sample_poses
 from handavatar.hand.rig import PosedHand, Rig, ShapedHand
 from handavatar.train.stage_times import StageTimes
@@ -26,7 +26,7 @@ SURFACE_SIGMAS = (0.00025, 0.0005, 0.001, 0.003)
 SURFACE_SHARE = 0.9
 """Share of the training points near the surface; the others lie anywhere in the part boxes."""
 JOINT_WEIGHT = 0.7
-"""Where no bone has more of a face than this, the face is at a joint: a sixth of the skin."""
+"""Where no bone has more of a face than this, the face is at a joint."""
 LARGEST_OFFSET = 0.002
 """Of people's hands from the rig's: standard deviation along each axis, at most, metres."""
 _WAVES = 8
@@ -35,11 +35,21 @@ _WAVELENGTHS = (0.03, 0.15)
 
 @dataclass(frozen=True, eq=False)
 class LabelledPose:
-    """A posed hand with points whose inside or outside is known."""
+    """A posed hand with points whose inside or outside is known.
+
+    Attributes:
+        posed: the hand.
+        points: metres, in its world.
+        is_inside: of each.
+        joint_pairs: of the last points, which lie where two connected parts meet, the pair.
+    """
 
     posed: PosedHand
     points: Float[Tensor, "points 3"]
     is_inside: Bool[Tensor, "points"]
+    joint_pairs: Int[Tensor, "joints"] = field(
+        default_factory=lambda: torch.zeros(0, dtype=torch.int64)
+    )
 
 
 def sample_points(
@@ -90,7 +100,7 @@ class PoseStream:
         margin: of the part boxes, metres.
         points: on each hand.
         seed: of everything.
-        joint_share: of the points near the surface, those at joints: see :func:`training_points`.
+        joint_points: further points on each, where parts meet: see :func:`joint_points`.
     """
 
     base: Rig
@@ -99,7 +109,7 @@ class PoseStream:
     margin: float
     points: int
     seed: int
-    joint_share: float = 0.0
+    joint_points: int = 0
 
     def drawn(self, number: int, times: StageTimes) -> LabelledPose:
         """Hand ``number`` of the stream."""
@@ -111,26 +121,22 @@ class PoseStream:
             hand = _random_shape(self.rig, generator)
             posed = hand.posed(HandPose(rotations, torch.zeros(3)))
         with times.stage("points"):
-            points = training_points(
-                self.parts, posed, self.points, self.margin, generator, self.joint_share
-            )
+            points = training_points(self.parts, posed, self.points, self.margin, generator)
+            pairs = torch.zeros(0, dtype=torch.int64)
+            if self.joint_points:
+                at_joints, pairs = joint_points(posed, self.joint_points, generator)
+                points = torch.cat([points, at_joints])
         with times.stage("labels"):
             labels = is_inside(posed.sealed_vertices, self.rig.sealed_faces, points)
-        return LabelledPose(posed, points, labels)
+        return LabelledPose(posed, points, labels, pairs)
 
 
 def training_points(
-    parts: Parts,
-    posed: PosedHand,
-    count: int,
-    margin: float,
-    generator: torch.Generator,
-    joint_share: float = 0.0,
+    parts: Parts, posed: PosedHand, count: int, margin: float, generator: torch.Generator
 ) -> Float[Tensor, "points 3"]:
     """Points to learn from: a few in the part boxes first, then those near the surface.
 
-    Without gradient and on the CPU. Of the latter ``joint_share`` lie at joints, where several
-    bones move the skin and one part of a field hands over to the next.
+    Without gradient and on the CPU.
 
     Departs: COAP and the paper draw half the points in the boxes and half near the surface, with
         noise of one sigma. Nine in ten errors of a trained field lie within half a millimetre of
@@ -138,17 +144,31 @@ def training_points(
     """
     num_near = round(count * SURFACE_SHARE)
     uniform = _box_points(parts, posed, count - num_near, margin, generator)
-    sigmas = torch.tensor(SURFACE_SIGMAS)[torch.arange(num_near) % len(SURFACE_SIGMAS)]
-    num_at_joints = round(num_near * joint_share)
-    pieces = [uniform]
-    if num_at_joints:
-        rig = posed.rig
-        is_joint = rig.skin_weights[rig.faces].mean(1).amax(-1) < JOINT_WEIGHT
-        at_joints = rig.faces[is_joint]
-        pieces.append(_surface_points(posed, sigmas[:num_at_joints], generator, at_joints))
-    if num_at_joints < num_near:
-        pieces.append(_surface_points(posed, sigmas[num_at_joints:], generator))
-    return torch.cat(pieces)
+    return torch.cat([uniform, _surface_points(posed, _sigmas(num_near), generator)])
+
+
+def joint_points(
+    posed: PosedHand, count: int, generator: torch.Generator
+) -> tuple[Float[Tensor, "points 3"], Int[Tensor, "points"]]:
+    """Points near the skin where two connected parts meet, and the pair of each.
+
+    Without gradient and on the CPU; of sealed faces on which no bone has more than
+    ``JOINT_WEIGHT`` and the two that have most are connected: a seventh of the skin.
+    """
+    weights, faces = posed.rig.skin_weights.cpu(), posed.rig.faces.cpu()
+    vertices = posed.vertices.detach().cpu()
+    pair_of = torch.full((NUM_BONES, NUM_BONES), -1)
+    for pair, (first, second) in enumerate(CONNECTED_PAIRS):
+        pair_of[first, second] = pair_of[second, first] = pair
+
+    def pairs_at(corners: Int[Tensor, "faces 3"]) -> Int[Tensor, "faces"]:
+        largest, bones = weights[corners].mean(1).topk(2, dim=-1)
+        pairs = pair_of[bones[:, 0], bones[:, 1]]
+        return torch.where(largest[:, 0] < JOINT_WEIGHT, pairs, -1)
+
+    surface = sample_surface(vertices, faces[pairs_at(faces) >= 0], count, generator)
+    noise = torch.randn(count, 3, generator=generator)
+    return surface.positions(vertices) + _sigmas(count)[:, None] * noise, pairs_at(surface.faces)
 
 
 def random_person(rest: ShapedHand, generator: torch.Generator) -> ShapedHand:
@@ -184,15 +204,15 @@ def _box_points(
     return apply_rigid(posed.world_from_bone.detach().cpu()[bone], local[:, None])[:, 0]
 
 
+def _sigmas(count: int) -> Float[Tensor, "points"]:
+    return torch.tensor(SURFACE_SIGMAS)[torch.arange(count) % len(SURFACE_SIGMAS)]
+
+
 def _surface_points(
-    posed: PosedHand,
-    sigmas: Float[Tensor, "points"],
-    generator: torch.Generator,
-    faces: Int[Tensor, "faces 3"] | None = None,
+    posed: PosedHand, sigmas: Float[Tensor, "points"], generator: torch.Generator
 ) -> Float[Tensor, "points 3"]:
-    """Points of the sealed surface, or of the given faces, with noise of so many metres."""
-    sealed = posed.sealed_vertices.detach().cpu()
-    faces = (posed.rig.sealed_faces if faces is None else faces).cpu()
+    """Points of the sealed surface with noise of so many metres in every direction."""
+    sealed, faces = posed.sealed_vertices.detach().cpu(), posed.rig.sealed_faces.cpu()
     surface = sample_surface(sealed, faces, len(sigmas), generator)
     noise = torch.randn(len(sigmas), 3, generator=generator)
     return surface.positions(sealed) + sigmas[:, None] * noise

@@ -71,8 +71,9 @@ class PriorOptions:
         steps: optimisation steps.
         poses: poses per step, all of them new; processes share them.
         points: labelled points per pose.
-        joint_share: how much of those near the surface is drawn at joints alone, in [0, 1]; for
-            the last steps, so that no seam is left where parts meet.
+        joint_points: further points per pose where two parts meet, at which both must be right
+            and not only the one that decides; PairOF alone. For the last steps: it takes a seam
+            away.
         lr: the highest learning rate, soon after the start.
         final_lr: learning rate at the end; half a cosine in between.
         rig: the hand: ``open-hand``, an imported one (``mano-right``) or its file.
@@ -92,7 +93,7 @@ class PriorOptions:
     steps: int = 10_000
     poses: int = 1
     points: int = 1024
-    joint_share: float = 0.0
+    joint_points: int = 0
     lr: float = 1e-3
     final_lr: float = 5e-5
     rig: str = "open-hand"
@@ -124,11 +125,14 @@ def train_prior(
         CheckpointError: if ``folder`` holds something else than a run with these options.
         Interrupted: after SIGINT or SIGTERM; a checkpoint was saved if there is a ``folder``.
         RigError: if there is no such rig, or not at this level.
-        ValueError: if the processes cannot share the poses of a step evenly, or on a share that is
-            none.
+        ValueError: if the processes cannot share the poses of a step evenly, or for points at
+            joints with another decoder.
     """
-    if not 0 <= options.joint_share <= 1:
-        raise ValueError(f"prior: found the joint share {options.joint_share}, expected 0 to 1")
+    if options.joint_points and options.decoder != "pair":
+        raise ValueError(
+            f"prior: found {options.joint_points} points at joints for the decoder "
+            f"{options.decoder!r}; only 'pair' answers for two parts at once"
+        )
     base = load_rig(options.rig, options.level)
     with joined_processes(options.device) as processes, stop_signals() as stopped:
         if options.poses % processes.count:
@@ -169,7 +173,7 @@ def _trained(
             done, average = load_progress(Run(options.folder), field, optimizers)
     rig, parts = finer_rig(base, options.rounds)
     stream = PoseStream(
-        base, rig, parts, field.margin, options.points, options.seed, options.joint_share
+        base, rig, parts, field.margin, options.points, options.seed, options.joint_points
     )
     times = StageTimes()
     loss_of: nn.Module = OccupancyLoss(field, parts.to(processes.device), times)
