@@ -11,12 +11,13 @@ from safetensors.torch import load_file, save_file
 
 from handavatar.avatar import CheckpointError
 from handavatar.field.decoders import Decoder, untrained_field
-from handavatar.field.occupancy import PairOccupancy
+from handavatar.field.occupancy import LENGTH_SCALE, PairOccupancy, contains, local_points
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import divide_into_parts
-from handavatar.hand.pose import NUM_BONES
-from handavatar.train.labelled_poses import labelled_pose
+from handavatar.hand.pose import CONNECTED_PAIRS, NUM_BONES
+from handavatar.train.labelled_poses import PoseStream, labelled_pose
+from handavatar.train.pretraining import OccupancyLoss
 from handavatar.train.prior import (
     SHIPPED_PRIOR,
     PriorEvaluationOptions,
@@ -26,6 +27,7 @@ from handavatar.train.prior import (
     open_prior,
     train_prior,
 )
+from handavatar.train.stage_times import StageTimes
 
 
 def _options(out: Path) -> PriorOptions:
@@ -120,3 +122,40 @@ def test_the_shipped_prior_knows_poses_it_never_saw() -> None:
     scores = evaluate_prior(PriorEvaluationOptions(poses=4, points=2048))
     assert scores["iou"] >= 0.95
     assert scores["iou"] == pytest.approx((scores["iou_boxes"] + scores["iou_surface"]) / 2)
+
+
+def test_at_joints_both_parts_are_asked_and_not_the_deciding_one_alone() -> None:
+    """The loss against a loop over the plain decoder, with the same points."""
+    rig = load_open_hand("778")
+    parts = divide_into_parts(rig)
+    field = PairOccupancy()
+    load_prior(field)
+    stream = PoseStream(rig, rig, parts, field.margin, 64, seed=5, joint_points=40)
+    sample = stream.drawn(0, StageTimes())
+    without = replace(sample, joint_pairs=sample.joint_pairs[:0])
+    loss = OccupancyLoss(field, parts, StageTimes())
+    found = float((loss([sample]) - loss([without])).detach())
+
+    codes = field.encode(parts, sample.posed)
+    expected = 0.0
+    points, labels = sample.points[64:], sample.is_inside[64:]
+    for point, label, pair in zip(points, labels, sample.joint_pairs, strict=True):
+        members = torch.tensor(CONNECTED_PAIRS[int(pair)])
+        local = local_points(codes.boxes, point[None])
+        queries = LENGTH_SCALE * local[0, members]
+        logits = field.decoder(codes.part_codes[members][None], queries[None])[0]
+        is_in_box = contains(codes.boxes, local)[0, members]
+        assert bool(is_in_box.any())
+        target = label.float().expand(2)
+        each = torch.nn.functional.binary_cross_entropy_with_logits(
+            logits, target, reduction="none"
+        )
+        expected += float(each[is_in_box].sum().detach()) / 80
+    assert found == pytest.approx(expected, rel=1e-4)
+
+
+def test_points_at_joints_are_for_pairs_alone(tmp_path: Path) -> None:
+    options = replace(_options(tmp_path / "a"), decoder="coap", joint_points=10)
+    with pytest.raises(ValueError, match="10 points at joints for the decoder 'coap'"):
+        train_prior(options)
+    assert not list(tmp_path.iterdir())
