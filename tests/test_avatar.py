@@ -17,7 +17,6 @@ from handavatar.avatar import (
     HandAvatar,
     Rendering,
     RenderSettings,
-    chosen_kernel,
 )
 from handavatar.edit import Edit, bones_named
 from handavatar.field.shading import OrientedCues
@@ -94,17 +93,6 @@ def test_a_batch_is_rendered_as_its_hands_are_one_by_one(small_avatar: HandAvata
         assert torch.equal(picture.color, small_avatar.render(pose, camera).color)
     with pytest.raises(ValueError, match="3 poses and 2 cameras"):
         small_avatar.render_batch(poses, cameras[:2])
-
-
-def test_a_kernel_that_cannot_run_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert chosen_kernel("torch", "cpu") == "torch"
-    monkeypatch.setattr("handavatar.avatar.find_spec", lambda name: object())
-    assert chosen_kernel("triton-tf32", "cuda:0") == "triton-tf32"
-    with pytest.raises(ValueError, match="--kernel triton: needs a CUDA device, found cpu"):
-        chosen_kernel("triton", "cpu")
-    monkeypatch.setattr("handavatar.avatar.find_spec", lambda name: None)
-    with pytest.raises(ValueError, match="no package 'triton'"):
-        chosen_kernel("triton", "cuda")
 
 
 def test_at_the_outline_a_pixel_is_the_mean_of_four_rays(

@@ -20,17 +20,10 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from handavatar.avatar import (
-    EXACT,
-    HandAvatar,
-    Rendering,
-    RenderSettings,
-    chosen_device,
-    chosen_kernel,
-)
+from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chosen_device
 from handavatar.capture.motion import MOTIONS, Motion, named_motion, read_motion
 from handavatar.edit import Edit, bones_named
-from handavatar.field.occupancy import Kernel
+from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.geometry.cameras import Camera, look_at, project
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose

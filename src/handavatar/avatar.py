@@ -9,7 +9,6 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,8 @@ from torch import Tensor, nn
 
 from handavatar.edit import Edit
 from handavatar.field.anchors import Neighbours, nearest_anchors, place_anchors
-from handavatar.field.occupancy import HandCodes, Kernel, PairItems, PairOccupancy
+from handavatar.field.kernels import Kernel
+from handavatar.field.occupancy import HandCodes, PairItems, PairOccupancy
 from handavatar.field.shading import (
     AlbedoField,
     IlluminationField,
@@ -69,26 +69,6 @@ def chosen_device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def chosen_kernel(name: Kernel, device: torch.device | str) -> Kernel:
-    """What decodes pairs on a device.
-
-    Raises:
-        ValueError: if Triton is asked for where it is missing or there is no NVIDIA GPU.
-    """
-    if name == "torch":
-        return name
-    if find_spec("triton") is None:
-        raise ValueError(
-            f"--kernel {name}: there is no package 'triton' here; it comes with torch's builds for "
-            "CUDA; use --kernel torch"
-        )
-    if torch.device(device).type != "cuda":
-        raise ValueError(
-            f"--kernel {name}: needs a CUDA device, found {device}; use --kernel torch"
-        )
-    return name
-
-
 class CheckpointError(ValueError):
     """A file of weights that cannot be used: which, what is wrong with it, what to do."""
 
@@ -114,7 +94,7 @@ class RenderSettings:
         edge_rays: at the hand's outline a pixel is the mean of so many rays in both directions; a
             single one says all or nothing of a pixel that the hand covers in part.
         rays_at_once: bounds the memory.
-        kernel: what decodes pairs of parts; see :func:`chosen_kernel`.
+        kernel: what decodes pairs of parts; see :func:`handavatar.field.kernels.chosen_kernel`.
     """
 
     num_samples: int = 64

@@ -12,7 +12,8 @@ from conftest import any_pose, bent_pose, camera_above
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar, RenderSettings
-from handavatar.field.occupancy import Kernel, Occupancy, PairOccupancy
+from handavatar.field.kernels import Kernel
+from handavatar.field.occupancy import Occupancy, PairOccupancy
 from handavatar.hand.parts import Parts
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations

@@ -20,8 +20,8 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from handavatar.field.kernels import Precision
 from handavatar.field.layers import PointNet, ResidualBlock, SkipMLP
-from handavatar.field.occupancy import Precision
 
 _BLOCK = 64
 """Items at a time in one program."""

@@ -11,12 +11,13 @@ hold the point, shares first layers between pairs, and is fast.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from handavatar.field.kernels import PRECISIONS, Kernel, Precision
 from handavatar.field.layers import PointNet, SkipMLP
 from handavatar.field.threads import mapped
 from handavatar.hand.parts import PartBoxes, Parts
@@ -33,11 +34,6 @@ LOGIT_SCALE = 10.0
 """The decoder's output is multiplied by this: a surface needs logits of some units per mm."""
 BOX_MARGIN = 0.012
 """How far a part's box reaches beyond the part, metres."""
-
-Precision = Literal["ieee", "tf32", "bf16"]
-"""Of the factors of matrix products; sums and everything else have 32 bits."""
-Kernel = Literal["torch", "triton", "triton-tf32", "triton-bf16"]
-"""What decodes pairs without gradient: torch's operations, or kernels for NVIDIA GPUs."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -378,7 +374,7 @@ class PairOccupancy(nn.Module):
         if kernel == "torch":
             logits = self._item_logits(codes, local, items, item_of_answer)
         else:
-            precision = cast(Precision, kernel.partition("-")[2] or "ieee")
+            precision = PRECISIONS[kernel]
             logits = self._fused_logits(codes, points, items, item_of_answer, side, precision)
 
         answer_points = point_index[item_of_answer]
@@ -432,16 +428,16 @@ class PairOccupancy(nn.Module):
         precision: Precision,
     ) -> Float[Tensor, "answers"]:
         """The same by the kernels of :mod:`handavatar.field.fused`."""
-        from handavatar.field import fused
+        from handavatar.field.fused import fused_logits, pack_weights
 
         network, mlp = self.decoder.pointnet, self.decoder.mlp
         # Weights that a step has changed, or that were moved, are packed anew.
         state = tuple((weight.data_ptr(), weight._version) for weight in self.decoder.parameters())
         if self._packed is None or self._packed[0] != (precision, state):
-            packed = fused.pack_weights(network, mlp, precision, LENGTH_SCALE, LOGIT_SCALE)
+            packed = pack_weights(network, mlp, precision, LENGTH_SCALE, LOGIT_SCALE)
             self._packed = (precision, state), packed
         weights = self._packed[1]
-        return fused.fused_logits(
+        return fused_logits(
             weights,
             codes.part_codes @ weights.of_code.T + network.input.bias,
             codes.boxes.bone_from_world,
