@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from handavatar.edit import Edit
 from handavatar.field.anchors import Neighbours, nearest_anchors, place_anchors
-from handavatar.field.kernels import Kernel
+from handavatar.field.kernels import PRECISIONS, Kernel
 from handavatar.field.occupancy import HandCodes, PairItems, PairOccupancy
 from handavatar.field.shading import (
     AlbedoField,
@@ -94,7 +94,8 @@ class RenderSettings:
         edge_rays: at the hand's outline a pixel is the mean of so many rays in both directions; a
             single one says all or nothing of a pixel that the hand covers in part.
         rays_at_once: bounds the memory.
-        kernel: what decodes pairs of parts; see :func:`handavatar.field.kernels.chosen_kernel`.
+        kernel: what decodes pairs of parts; see :func:`handavatar.field.kernels.chosen_kernel`. With
+            shorter factors, samples that can be seen are evaluated once more with 32 bits.
     """
 
     num_samples: int = 64
@@ -381,7 +382,8 @@ class HandAvatar(nn.Module):
         is_kept = visibility(occupancy) > settings.smallest_weight
         kept = is_kept.nonzero()
         directed = directed_occupancy(soft)[is_kept]
-        if torch.is_grad_enabled():
+        # What shorter factors have only found is evaluated again where it can be seen.
+        if torch.is_grad_enabled() or PRECISIONS.get(settings.kernel, "ieee") != "ieee":
             position = torch.full((num_rays * num_samples,), -1, device=depths.device)
             position[is_kept.flatten()] = torch.arange(len(kept), device=depths.device)
             item_position = position[items.points]

@@ -105,10 +105,15 @@ def test_weights_that_a_step_has_changed_are_read_anew(rig: Rig, parts: Parts) -
     torch.testing.assert_close(found.whole, expected.whole, atol=1e-4, rtol=0)
 
 
-def test_a_picture_is_the_same(small_avatar: HandAvatar) -> None:
+@pytest.mark.parametrize(
+    ("kernel", "largest"), [("triton", 1e-4), ("triton-tf32", 0.002), ("triton-bf16", 0.002)]
+)
+def test_a_picture_is_the_same(small_avatar: HandAvatar, kernel: Kernel, largest: float) -> None:
+    """With shorter factors too: what can be seen is evaluated again."""
     avatar = small_avatar.moved_to(DEVICE)
     pose, camera = bent_pose(3), camera_above(12)
     expected = avatar.render(pose, camera, settings=RenderSettings(edge_rays=1))
-    found = avatar.render(pose, camera, settings=RenderSettings(edge_rays=1, kernel="triton"))
+    found = avatar.render(pose, camera, settings=RenderSettings(edge_rays=1, kernel=kernel))
     assert float(expected.alpha.sum()) > 15
-    assert float((found.color - expected.color).abs().max()) < 1e-4
+    error = (found.color - expected.color).abs()
+    assert float(error.max()) < largest
