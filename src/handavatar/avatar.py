@@ -84,9 +84,9 @@ class RenderSettings:
         stop: a ray ends where less than this share of light is left; the error is at most that.
         coarse: every so many samples are evaluated first, the others only near the hand; 1
             evaluates all.
-        refine_above: an interval is near the hand if the occupancy at one of its ends is larger;
-            that of sharpness 1, whose tail reaches some millimetres. Validated, not proven: a part
-            thinner than an interval and farther than that from both its ends is missed.
+        refine_above: an interval is near the hand if the soft occupancy at one of its ends is
+            larger. Unlike the occupancy, it still tells near from far some millimetres off the
+            hand. Validated, not proven: what is much thinner than an interval may be missed.
         group: coarse samples evaluated at a time along the ray before it may end.
         mask_margin: only pixels within this share of the picture's width of the posed mesh are
             looked at; 6 pixels of 256. The occupancy of a trained field ends some millimetres
@@ -102,7 +102,7 @@ class RenderSettings:
     smallest_weight: float = 1e-4
     stop: float = 1e-4
     coarse: int = 4
-    refine_above: float = 3e-7
+    refine_above: float = 0.12
     group: int = 4
     mask_margin: float = 6 / 256
     edge_rays: int = 2
@@ -432,10 +432,8 @@ class HandAvatar(nn.Module):
             light[alive] *= (1 - occupancy[alive][:, window]).prod(1)
             alive = alive[light[alive] > settings.stop]
         if settings.coarse > 1:
-            at_coarse = occupancy[:, coarse]
-            # Far outside, the sigmoid of three times a logit is the third power of the sigmoid.
-            is_near = at_coarse > settings.refine_above**self.occupancy.sharpness
-            is_lit = (1 - at_coarse).cumprod(1) > settings.stop
+            is_near = soft[:, coarse].amax(-1) > settings.refine_above
+            is_lit = (1 - occupancy[:, coarse]).cumprod(1) > settings.stop
             ray, interval = ((is_near[:, :-1] | is_near[:, 1:]) & is_lit[:, :-1]).nonzero().T
             between = coarse[interval][:, None] + torch.arange(1, settings.coarse).to(coarse)
             is_between = between < coarse[interval + 1][:, None]

@@ -2,7 +2,7 @@
 
 import torch
 
-from handavatar.geometry.meshes import distance_to_mesh, unique_edges
+from handavatar.geometry.meshes import distance_to_mesh, is_inside, unique_edges
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import divide_into_parts
 from handavatar.hand.pose import CONNECTED_PAIRS, HandPose
@@ -78,13 +78,15 @@ def test_most_points_lie_near_the_surface_and_some_anywhere() -> None:
 
 def test_points_at_joints_lie_where_the_two_parts_of_their_pair_meet() -> None:
     posed = RIG.shaped().posed(HandPose(torch.zeros(16, 3), torch.zeros(3)))
-    points, pairs = joint_points(posed, 500, torch.Generator().manual_seed(0))
+    points, pairs, is_within = joint_points(posed, 500, torch.Generator().manual_seed(0))
     assert float(distance_to_mesh(posed.vertices, RIG.faces, points).median()) < 0.001
     assert set(pairs.tolist()) == set(range(len(CONNECTED_PAIRS)))
     near = (points[:, None] - posed.vertices).square().sum(-1).argmin(1)
     weights = RIG.skin_weights[near].gather(1, torch.tensor(CONNECTED_PAIRS)[pairs])
     assert float(weights.sum(1).mean()) > 0.8
     assert float(weights.amin(1).mean()) > 0.2
+    truth = is_inside(posed.sealed_vertices, RIG.sealed_faces, points)
+    assert float((truth == is_within).float().mean()) > 0.9
 
 
 def test_points_at_joints_come_last_and_leave_the_others_as_they_are() -> None:
@@ -94,3 +96,4 @@ def test_points_at_joints_come_last_and_leave_the_others_as_they_are() -> None:
     assert torch.equal(more.points[:512], plain.points) and len(more.points) == 612
     assert torch.equal(more.is_inside[:512], plain.is_inside)
     assert 20 < int(more.is_inside[512:].sum()) < 80
+    assert 50 < int((more.joint_pairs >= 0).sum()) <= 100

@@ -41,7 +41,8 @@ class LabelledPose:
         posed: the hand.
         points: metres, in its world.
         is_inside: of each.
-        joint_pairs: of the last points, which lie where two connected parts meet, the pair.
+        joint_pairs: of the last points, which lie where two connected parts meet, the pair; -1
+            where more than the two parts decides the label.
     """
 
     posed: PosedHand
@@ -124,10 +125,13 @@ class PoseStream:
             points = training_points(self.parts, posed, self.points, self.margin, generator)
             pairs = torch.zeros(0, dtype=torch.int64)
             if self.joint_points:
-                at_joints, pairs = joint_points(posed, self.joint_points, generator)
+                at_joints, pairs, is_within = joint_points(posed, self.joint_points, generator)
                 points = torch.cat([points, at_joints])
         with times.stage("labels"):
             labels = is_inside(posed.sealed_vertices, self.rig.sealed_faces, points)
+        if self.joint_points:
+            # Where another finger touches or the skin folds, the two parts cannot know the label.
+            pairs[labels[-len(pairs) :] != is_within] = -1
         return LabelledPose(posed, points, labels, pairs)
 
 
@@ -149,8 +153,10 @@ def training_points(
 
 def joint_points(
     posed: PosedHand, count: int, generator: torch.Generator
-) -> tuple[Float[Tensor, "points 3"], Int[Tensor, "points"]]:
-    """Points near the skin where two connected parts meet, and the pair of each.
+) -> tuple[Float[Tensor, "points 3"], Int[Tensor, "points"], Bool[Tensor, "points"]]:
+    """Points near the skin where two connected parts meet, the pair of each, and which lie within.
+
+    Within: behind the face that the point was drawn on, whatever else of the hand is there.
 
     Without gradient and on the CPU; of sealed faces on which no bone has more than
     ``JOINT_WEIGHT`` and the two that have most are connected: a seventh of the skin.
@@ -158,8 +164,8 @@ def joint_points(
     weights, faces = posed.rig.skin_weights.cpu(), posed.rig.faces.cpu()
     vertices = posed.vertices.detach().cpu()
     pair_of = torch.full((NUM_BONES, NUM_BONES), -1)
-    for pair, (first, second) in enumerate(CONNECTED_PAIRS):
-        pair_of[first, second] = pair_of[second, first] = pair
+    for number, (parent, child) in enumerate(CONNECTED_PAIRS):
+        pair_of[parent, child] = pair_of[child, parent] = number
 
     def pairs_at(corners: Int[Tensor, "faces 3"]) -> Int[Tensor, "faces"]:
         largest, bones = weights[corners].mean(1).topk(2, dim=-1)
@@ -167,8 +173,11 @@ def joint_points(
         return torch.where(largest[:, 0] < JOINT_WEIGHT, pairs, -1)
 
     surface = sample_surface(vertices, faces[pairs_at(faces) >= 0], count, generator)
-    noise = torch.randn(count, 3, generator=generator)
-    return surface.positions(vertices) + _sigmas(count)[:, None] * noise, pairs_at(surface.faces)
+    noise = _sigmas(count)[:, None] * torch.randn(count, 3, generator=generator)
+    first, second, third = vertices[surface.faces].unbind(1)
+    outward = torch.linalg.cross(second - first, third - first)
+    is_within = (noise * outward).sum(-1) < 0
+    return surface.positions(vertices) + noise, pairs_at(surface.faces), is_within
 
 
 def random_person(rest: ShapedHand, generator: torch.Generator) -> ShapedHand:

@@ -112,13 +112,15 @@ class OccupancyLoss(nn.Module):
         """
         assert isinstance(self.field, PairOccupancy)
         with self.times.stage("decode"):
+            is_known = pairs >= 0
+            points, pairs, is_inside = points[is_known], pairs[is_known], is_inside[is_known]
             members = self.field.pairs[pairs]
             is_wanted = contains(codes.boxes, local_points(codes.boxes, points)).gather(1, members)
             order = torch.arange(len(points), device=points.device)
             logits = self.field.wanted_logits(codes, points, PairItems(order, pairs, is_wanted))
             target = is_inside[:, None].expand(-1, 2)[is_wanted].to(logits)
             total = nn.functional.binary_cross_entropy_with_logits(logits, target, reduction="sum")
-            return total / (2 * len(points))
+            return total / (2 * len(is_known))
 
     def _erring(
         self, codes: HandCodes, points: Float[Tensor, "points 3"], target: Float[Tensor, "points"]
