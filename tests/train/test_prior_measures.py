@@ -34,7 +34,8 @@ def test_a_prior_gets_a_row_per_hand_that_json_can_hold() -> None:
         # The coarse hand is not the one that the prior was made for: near, not good.
         assert row.iou > 0.6 and row.cham < 15 and row.pieces < 5
         assert row.cham == pytest.approx((row.cham_to_truth + row.cham_from_truth) / 2)
-        assert row.saved >= 1
+        # So coarse a grid is asked everywhere, and then twice at each vertex.
+        assert 0.7 < row.saved < 1
     assert rows[1].contact_error is not None and 0 <= rows[1].contact_error < 0.5
     summary = summarised(rows)
     json.dumps(summary, allow_nan=False)

@@ -53,7 +53,8 @@ class GeometryRow:
             encloses.
         voxel: of the extraction.
         evaluations: points at which the field was asked.
-        saved: how many times as many the dense grid has.
+        saved: how many times as many the dense grid has; less than 1 where the grid is so coarse
+            that it is asked everywhere and vertices are corrected.
         seconds: of the extraction.
     """
 
