@@ -10,6 +10,7 @@ from handavatar.train.labelled_poses import (
     LARGEST_OFFSET,
     LabelledPose,
     PoseStream,
+    joint_faces,
     joint_points,
     random_person,
 )
@@ -78,7 +79,8 @@ def test_most_points_lie_near_the_surface_and_some_anywhere() -> None:
 
 def test_points_at_joints_lie_where_the_two_parts_of_their_pair_meet() -> None:
     posed = RIG.shaped().posed(HandPose(torch.zeros(16, 3), torch.zeros(3)))
-    points, pairs, is_within = joint_points(posed, 500, torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    points, pairs, is_within = joint_points(posed, *joint_faces(RIG), 500, generator)
     assert float(distance_to_mesh(posed.vertices, RIG.faces, points).median()) < 0.001
     assert set(pairs.tolist()) == set(range(len(CONNECTED_PAIRS)))
     near = (points[:, None] - posed.vertices).square().sum(-1).argmin(1)

@@ -436,12 +436,7 @@ def counted(work: Callable[[], None]) -> tuple[int, int]:
 def _peak_flops(device: torch.device, size: int = 2048, tries: int = 3) -> float:
     """Operations a second of a large product of 32-bit matrices, the best of some tries."""
     left, right = torch.rand(2, size, size, device=device)
-    spent = []
-    for _ in range(tries):
-        begin = _now(device)
-        left @ right
-        spent.append(_now(device) - begin)
-    return 2 * size**3 / min(spent)
+    return 2 * size**3 / _best_seconds(lambda: left @ right, device, tries)
 
 
 def _row(

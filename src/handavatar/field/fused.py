@@ -17,7 +17,7 @@ from typing import Any, cast
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from handavatar.field.kernels import Precision
@@ -36,6 +36,7 @@ class PackedWeights:
         matrices: of the trunk, then of the answers; inputs times outputs each.
         vectors: the position's rows of the first layer, then all biases.
         of_code: the code's part of the first layer.
+        precision: of the matrices.
         num_trunk_matrices: entries of ``matrices`` that belong to the trunk.
         num_trunk_vectors: entries of ``vectors`` that do.
     """
@@ -43,6 +44,7 @@ class PackedWeights:
     matrices: Float[Tensor, "entries"]
     vectors: Float[Tensor, "rows"]
     of_code: Float[Tensor, "128 64"]
+    precision: Precision
     num_trunk_matrices: int
     num_trunk_vectors: int
 
@@ -121,21 +123,21 @@ def _own(values, hidden, out, matrices, PRECISION: tl.constexpr, IS_INTERPRETED:
 
 @triton.jit
 def _trunk(
-    points, point_of, pair_of, pairs, transforms, code_biases, matrices, vectors, tokens, count,
+    points, point_of, members, transforms, code_biases, matrices, vectors, tokens, count,
     BLOCK: tl.constexpr, PRECISION: tl.constexpr, IS_INTERPRETED: tl.constexpr,
 ):  # fmt: skip
     item = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     is_item = item < count
     point = points + 3 * tl.load(point_of + item, mask=is_item, other=0)
     x, y, z = tl.load(point), tl.load(point + 1), tl.load(point + 2)
-    pair = pairs + 2 * tl.load(pair_of + item, mask=is_item, other=0)
+    pair = members + 2 * item
     first = _opened(
-        tl.load(pair), x, y, z, transforms, code_biases, matrices, vectors,
-        PRECISION, IS_INTERPRETED,
+        tl.load(pair, mask=is_item, other=0), x, y, z,
+        transforms, code_biases, matrices, vectors, PRECISION, IS_INTERPRETED,
     )  # fmt: skip
     second = _opened(
-        tl.load(pair + 1), x, y, z, transforms, code_biases, matrices, vectors,
-        PRECISION, IS_INTERPRETED,
+        tl.load(pair + 1, mask=is_item, other=0), x, y, z,
+        transforms, code_biases, matrices, vectors, PRECISION, IS_INTERPRETED,
     )  # fmt: skip
     matrices += 20480
     vectors += 512
@@ -224,6 +226,7 @@ def pack_weights(
         _flat(trunk + answers).to(torch.bfloat16 if precision == "bf16" else torch.float32),
         _flat(trunk_vectors + vectors),
         of_code,
+        precision,
         sum(matrix.numel() for matrix in trunk),
         sum(vector.numel() for vector in trunk_vectors),
     )
@@ -233,45 +236,38 @@ def fused_logits(
     weights: PackedWeights,
     code_biases: Float[Tensor, "bones 128"],
     bone_from_world: Float[Tensor, "bones 4 4"],
-    pairs: Int[Tensor, "pairs 2"],
     points: Float[Tensor, "points 3"],
     item_points: Int[Tensor, "items"],
-    item_pairs: Int[Tensor, "items"],
-    answer_items: Int[Tensor, "answers"],
-    answer_sides: Int[Tensor, "answers"],
-    precision: Precision = "ieee",
-) -> Float[Tensor, "answers"]:
+    members: Int[Tensor, "items 2"],
+    is_wanted: Bool[Tensor, "items 2"],
+) -> Float[Tensor, "wanted"]:
     """Logits of the wanted answers, without gradient.
 
     Args:
-        weights: packed with the same precision.
+        weights: packed; with ``tf32`` or ``bf16`` for looking, not for what must be exact.
         code_biases: the first layer of each part's code, bias included.
         bone_from_world: frames of the parts, metres.
-        pairs: the two parts of each pair.
         points: in the world, metres.
         item_points: the point of each item.
-        item_pairs: its pair.
-        answer_items: the item of each answer.
-        answer_sides: 0 for the first part of its pair, 1 for the second.
-        precision: of the factors of matrix products; ``tf32`` and ``bf16`` are for looking, not
-            for pictures that must be exact.
+        members: the two parts of each item's pair.
+        is_wanted: which of their answers.
 
     Source: paper Sec. 3.2 and appendix (local-pair decoder).
     """
-    num_items, num_answers = len(item_points), len(answer_items)
+    answer_items, answer_sides = is_wanted.nonzero().unbind(-1)
+    num_items, num_answers = len(members), len(answer_items)
     tokens = points.new_empty(num_items, 2, 64)
     logits = points.new_empty(num_answers)
     constants: dict[str, Any] = {
         "BLOCK": _BLOCK,
-        "PRECISION": precision,
+        "PRECISION": weights.precision,
         "IS_INTERPRETED": _IS_INTERPRETED,
     }
     if num_items:
         _trunk[(triton.cdiv(num_items, _BLOCK),)](
             points.contiguous(),
             item_points.contiguous(),
-            item_pairs.contiguous(),
-            pairs.contiguous(),
+            members.contiguous(),
             bone_from_world[:, :3].contiguous(),
             code_biases.contiguous(),
             weights.matrices,

@@ -73,9 +73,7 @@ class Occupancy:
     Attributes:
         whole: of the hand, in [0, 1], surface at 0.5.
         soft_parts: soft occupancy of each part, in [0, 1], zero outside its box.
-        winners: per point, the index into ``items`` and the side (0 or 1) of the decoded answers
-            that decide the value; all answers for a fusion that mixes them.
-        items: the decoded pairs that decide the values.
+        items: the decoded pairs that decide the values, one a point; all for a fusion that mixes.
     """
 
     whole: Float[Tensor, "points"]
@@ -340,20 +338,29 @@ class PairOccupancy(nn.Module):
     ) -> Float[Tensor, "wanted"]:
         """The wanted answers of the given pairs, with gradient, by exact algebra.
 
-        The constant part code enters the first layer as a bias; the pooled half of every later
-        block runs once per pair; the last block and the MLP run for wanted answers only.
+        The constant part code enters the first layer as a bias; then :meth:`_answers`.
         """
         members, queries = self._members_and_queries(codes, points, items)
         network = self.decoder.pointnet
         of_code, of_query = network.input.weight.split((CODE_WIDTH, 3), dim=1)
         biases = codes.part_codes @ of_code.T + network.input.bias
         tokens = network.blocks[0](biases[members] + queries @ of_query.T)
-        *between, last = network.set_blocks
+        return self._answers(tokens, items.is_wanted)
+
+    def _answers(
+        self, tokens: Float[Tensor, "items 2 64"], is_wanted: Bool[Tensor, "items 2"]
+    ) -> Float[Tensor, "wanted"]:
+        """From the features after the first block to the wanted logits.
+
+        The pooled half of every block runs once per pair instead of once per member; the last
+        block and the MLP run for wanted answers only.
+        """
+        *between, last = self.decoder.pointnet.set_blocks
         for block in between:
             tokens = block.of_set(tokens, tokens.amax(-2))
-        item = items.is_wanted.nonzero()[:, 0]
-        answers = last.of_set(tokens[items.is_wanted][:, None], tokens.amax(-2)[item])[:, 0]
-        return LOGIT_SCALE * self.decoder.mlp(network.output(answers.relu()))[:, 0]
+        item = is_wanted.nonzero()[:, 0]
+        answers = last.of_set(tokens[is_wanted][:, None], tokens.amax(-2)[item])[:, 0]
+        return LOGIT_SCALE * self.decoder.mlp(self.decoder.pointnet.output(answers.relu()))[:, 0]
 
     def _chunk_occupancy(
         self, codes: HandCodes, points: Float[Tensor, "points 3"], kernel: Kernel
@@ -372,10 +379,9 @@ class PairOccupancy(nn.Module):
         items = PairItems(point_index, pair_index, is_wanted)
         item_of_answer, side = is_wanted.nonzero().unbind(-1)
         if kernel == "torch":
-            logits = self._item_logits(codes, local, items, item_of_answer)
+            logits = self._item_logits(codes, local, items)
         else:
-            precision = PRECISIONS[kernel]
-            logits = self._fused_logits(codes, points, items, item_of_answer, side, precision)
+            logits = self._fused_logits(codes, points, items, PRECISIONS[kernel])
 
         answer_points = point_index[item_of_answer]
         slots = answer_points * NUM_BONES + members[is_wanted]
@@ -393,62 +399,39 @@ class PairOccupancy(nn.Module):
         return Occupancy(self.fusion.over_parts(parts), soft * box_fade(local, codes.boxes), items)
 
     def _item_logits(
-        self,
-        codes: HandCodes,
-        local: Float[Tensor, "points bones 3"],
-        items: PairItems,
-        item_of_answer: Int[Tensor, "answers"],
-    ) -> Float[Tensor, "answers"]:
-        """The wanted answers of the given pairs, with torch's operations.
+        self, codes: HandCodes, local: Float[Tensor, "points bones 3"], items: PairItems
+    ) -> Float[Tensor, "wanted"]:
+        """The wanted answers of the given pairs, without gradient.
 
-        The constant part code enters the first layer as a bias; the first block runs once per
-        part instead of once per pair; the pooled half of every later block runs once per pair
-        instead of once per member; the last block and the MLP run for wanted answers only.
+        As :meth:`wanted_logits`, but the first block runs once per part instead of once per pair.
         """
         members = self.pairs[items.pairs]
         is_needed = torch.zeros_like(local[..., 0], dtype=torch.bool)
         is_needed[items.points[:, None], members] = True
         features, row_of = self._part_features(codes, local, is_needed)
-        tokens = features[row_of[members, items.points[:, None]]]
-        *between, last = self.decoder.pointnet.set_blocks
-        for block in between:
-            tokens = block.of_set(tokens, tokens.amax(1))
-        own, pooled = tokens[items.is_wanted], tokens.amax(1)[item_of_answer]
-        answers = last.of_set(own[:, None], pooled)[:, 0]
-        answers = self.decoder.pointnet.output(answers.relu_())
-        return LOGIT_SCALE * self.decoder.mlp(answers)[:, 0]
+        return self._answers(features[row_of[members, items.points[:, None]]], items.is_wanted)
 
     def _fused_logits(
         self,
         codes: HandCodes,
         points: Float[Tensor, "points 3"],
         items: PairItems,
-        item_of_answer: Int[Tensor, "answers"],
-        side: Int[Tensor, "answers"],
         precision: Precision,
-    ) -> Float[Tensor, "answers"]:
+    ) -> Float[Tensor, "wanted"]:
         """The same by the kernels of :mod:`handavatar.field.fused`."""
         from handavatar.field.fused import fused_logits, pack_weights
 
-        network, mlp = self.decoder.pointnet, self.decoder.mlp
+        network = self.decoder.pointnet
         # Weights that a step has changed, or that were moved, are packed anew.
         state = tuple((weight.data_ptr(), weight._version) for weight in self.decoder.parameters())
         if self._packed is None or self._packed[0] != (precision, state):
-            packed = pack_weights(network, mlp, precision, LENGTH_SCALE, LOGIT_SCALE)
+            packed = pack_weights(network, self.decoder.mlp, precision, LENGTH_SCALE, LOGIT_SCALE)
             self._packed = (precision, state), packed
         weights = self._packed[1]
-        return fused_logits(
-            weights,
-            codes.part_codes @ weights.of_code.T + network.input.bias,
-            codes.boxes.bone_from_world,
-            self.pairs,
-            points,
-            items.points,
-            items.pairs,
-            item_of_answer,
-            side,
-            precision,
-        )
+        biases = codes.part_codes @ weights.of_code.T + network.input.bias
+        frames = codes.boxes.bone_from_world
+        members = self.pairs[items.pairs]
+        return fused_logits(weights, biases, frames, points, items.points, members, items.is_wanted)
 
     def _part_features(
         self,

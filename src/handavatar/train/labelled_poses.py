@@ -6,6 +6,7 @@ so that several processes can share the work and a killed training can go on whe
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -112,6 +113,10 @@ class PoseStream:
     seed: int
     joint_points: int = 0
 
+    @cached_property
+    def _joint_faces(self) -> tuple[Int[Tensor, "faces 3"], Int[Tensor, "bones bones"]]:
+        return joint_faces(self.rig)
+
     def drawn(self, number: int, times: StageTimes) -> LabelledPose:
         """Hand ``number`` of the stream."""
         # Hashed, so that neither neighbouring seeds nor the seed that judges share numbers.
@@ -125,7 +130,9 @@ class PoseStream:
             points = training_points(self.parts, posed, self.points, self.margin, generator)
             pairs = torch.zeros(0, dtype=torch.int64)
             if self.joint_points:
-                at_joints, pairs, is_within = joint_points(posed, self.joint_points, generator)
+                at_joints, pairs, is_within = joint_points(
+                    posed, *self._joint_faces, self.joint_points, generator
+                )
                 points = torch.cat([points, at_joints])
         with times.stage("labels"):
             labels = is_inside(posed.sealed_vertices, self.rig.sealed_faces, points)
@@ -151,33 +158,47 @@ def training_points(
     return torch.cat([uniform, _surface_points(posed, _sigmas(num_near), generator)])
 
 
-def joint_points(
-    posed: PosedHand, count: int, generator: torch.Generator
-) -> tuple[Float[Tensor, "points 3"], Int[Tensor, "points"], Bool[Tensor, "points"]]:
-    """Points near the skin where two connected parts meet, the pair of each, and which lie within.
+def joint_faces(rig: Rig) -> tuple[Int[Tensor, "faces 3"], Int[Tensor, "bones bones"]]:
+    """Faces where two connected parts meet, on the CPU, and the number of each two bones' pair.
 
-    Within: behind the face that the point was drawn on, whatever else of the hand is there.
-
-    Without gradient and on the CPU; of sealed faces on which no bone has more than
-    ``JOINT_WEIGHT`` and the two that have most are connected: a seventh of the skin.
+    No bone has more of such a face than ``JOINT_WEIGHT``, and the two that have most are connected.
+    Bones that are not connected have the number -1.
     """
-    weights, faces = posed.rig.skin_weights.cpu(), posed.rig.faces.cpu()
-    vertices = posed.vertices.detach().cpu()
     pair_of = torch.full((NUM_BONES, NUM_BONES), -1)
     for number, (parent, child) in enumerate(CONNECTED_PAIRS):
         pair_of[parent, child] = pair_of[child, parent] = number
+    faces = rig.faces.cpu()
+    largest, bones = rig.skin_weights.cpu()[faces].mean(1).topk(2, dim=-1)
+    is_joint = (largest[:, 0] < JOINT_WEIGHT) & (pair_of[bones[:, 0], bones[:, 1]] >= 0)
+    return faces[is_joint], pair_of
 
-    def pairs_at(corners: Int[Tensor, "faces 3"]) -> Int[Tensor, "faces"]:
-        largest, bones = weights[corners].mean(1).topk(2, dim=-1)
-        pairs = pair_of[bones[:, 0], bones[:, 1]]
-        return torch.where(largest[:, 0] < JOINT_WEIGHT, pairs, -1)
 
-    surface = sample_surface(vertices, faces[pairs_at(faces) >= 0], count, generator)
+def joint_points(
+    posed: PosedHand,
+    faces: Int[Tensor, "faces 3"],
+    pair_of: Int[Tensor, "bones bones"],
+    count: int,
+    generator: torch.Generator,
+) -> tuple[Float[Tensor, "points 3"], Int[Tensor, "points"], Bool[Tensor, "points"]]:
+    """Points near the given faces, the pair that meets at each, and which lie within.
+
+    Within: behind the face that the point was drawn on, whatever else of the hand is there.
+    Without gradient and on the CPU.
+
+    Args:
+        posed: the hand.
+        faces: of its rig, and
+        pair_of: numbers of pairs: see :func:`joint_faces`.
+        count: how many.
+        generator: draws them.
+    """
+    vertices = posed.vertices.detach().cpu()
+    surface = sample_surface(vertices, faces, count, generator)
+    bones = posed.rig.skin_weights.cpu()[surface.faces].mean(1).topk(2, dim=-1).indices
     noise = _sigmas(count)[:, None] * torch.randn(count, 3, generator=generator)
     first, second, third = vertices[surface.faces].unbind(1)
-    outward = torch.linalg.cross(second - first, third - first)
-    is_within = (noise * outward).sum(-1) < 0
-    return surface.positions(vertices) + noise, pairs_at(surface.faces), is_within
+    is_within = (noise * torch.linalg.cross(second - first, third - first)).sum(-1) < 0
+    return surface.positions(vertices) + noise, pair_of[bones[:, 0], bones[:, 1]], is_within
 
 
 def random_person(rest: ShapedHand, generator: torch.Generator) -> ShapedHand:

@@ -72,8 +72,8 @@ class PriorOptions:
         poses: poses per step, all of them new; processes share them.
         points: labelled points per pose.
         joint_points: further points per pose where two parts meet, at which both must be right
-            and not only the one that decides; PairOF alone. For the last steps: it takes a seam
-            away.
+            and not only the one that decides; PairOF alone. For the last steps, against grooves
+            where parts meet.
         lr: the highest learning rate, soon after the start.
         final_lr: learning rate at the end; half a cosine in between.
         rig: the hand: ``open-hand``, an imported one (``mano-right``) or its file.
