@@ -9,7 +9,6 @@ from safetensors.torch import load_file
 
 from handavatar.capture.default import default_capture
 from handavatar.capture.frames import CaptureError, find_problems
-from handavatar.capture.pathtracer import linear_from_srgb, srgb_from_linear
 from handavatar.capture.synthetic import (
     SynthOptions,
     crop_camera,
@@ -143,13 +142,6 @@ def test_the_crop_leaves_the_margin_it_says():
     # Pixels of a 100 pixel picture, in float32.
     torch.testing.assert_close(extent.max(), torch.tensor(100 / 1.3), atol=1e-2, rtol=0)
     torch.testing.assert_close(center, torch.tensor([50.0, 50.0]), atol=1e-2, rtol=0)
-
-
-def test_stored_colors_and_light_are_inverse():
-    values = torch.linspace(0, 1, 256)
-    torch.testing.assert_close(
-        srgb_from_linear(linear_from_srgb(values)), values, atol=1e-5, rtol=0
-    )
 
 
 def test_training_sees_all_sides_and_testing_other_poses():

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from handavatar.capture.checks import CaptureError
 from handavatar.geometry.cameras import Camera
+from handavatar.geometry.colors import linear_from_srgb
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.geometry.rotations import invert_rigid
 from handavatar.hand.rig import Rig
@@ -70,18 +71,6 @@ class SurfaceMaps:
     albedo: Float[Tensor, "height width 3"]
     depth: Float[Tensor, "height width"]
     normals: Float[Tensor, "height width 3"]
-
-
-def linear_from_srgb(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Light intensities of stored sRGB values in [0, 1]."""
-    return torch.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-
-
-def srgb_from_linear(values: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
-    """Stored sRGB values of light intensities, which are clipped to [0, 1]."""
-    values = values.clamp(0, 1)
-    bright = 1.055 * values.clamp(min=1e-8) ** (1 / 2.4) - 0.055
-    return torch.where(values <= 0.0031308, 12.92 * values, bright)
 
 
 @cache

@@ -47,10 +47,10 @@ from handavatar.capture.pathtracer import (
     Traced,
     Variant,
     choose_variant,
-    srgb_from_linear,
 )
 from handavatar.capture.skin import SkinOptions, paint_skin, smooth_noise
 from handavatar.geometry.cameras import Camera, look_at, project
+from handavatar.geometry.colors import srgb_from_linear
 from handavatar.geometry.meshes import uniform_laplacian, unique_edges, vertex_normals
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.detail import subdivided

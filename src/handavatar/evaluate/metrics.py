@@ -14,6 +14,8 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from handavatar.evaluate.flip import flip_map
+
 PSNR_CEILING = 100.0
 """Decibels given to equal pictures, whose ratio is infinite: means stay finite, JSON valid."""
 
@@ -161,11 +163,13 @@ class MaskedScores:
     Attributes:
         psnr: decibels.
         ssim: at most 1.
+        flip: :func:`flip_map`, in [0, 1]; 0 is equal.
         worst5_psnr: mean over the worst 5 % of the frames, at least one.
     """
 
     psnr: float
     ssim: float
+    flip: float
     worst5_psnr: float
 
 
@@ -188,6 +192,7 @@ def masked_scores(frames: Sequence[JudgedFrame]) -> MaskedScores:
     return MaskedScores(
         psnr=_mean(ratios),
         ssim=_mean([masked_ssim(frame) for frame in frames]),
+        flip=_mean([masked_flip(frame) for frame in frames]),
         worst5_psnr=worst_mean(ratios, 0.05),
     )
 
@@ -205,6 +210,11 @@ def masked_ssim(frame: JudgedFrame) -> float:
     similarity = ssim_map(*frame.on_black())
     region = frame.region()[inner, inner]
     return float(similarity[region].mean()) if bool(region.any()) else float(similarity.mean())
+
+
+def masked_flip(frame: JudgedFrame) -> float:
+    """Mean of the FLIP map over the frame's region."""
+    return float(flip_map(*frame.on_black())[frame.region()].mean())
 
 
 def mean_mask_iou(frames: Sequence[JudgedFrame]) -> float:

@@ -142,7 +142,7 @@ def _measured(
     renderings: list[Rendering],
     judged: list[JudgedFrame],
 ) -> dict[str, Any]:
-    notes = ["masked.flip: null, the optional metric FLIP is not computed by this version"]
+    notes = []
     paper, masked = paper_scores(judged), masked_scores(judged)
     distance = perceptual_loss("auto")
     pairs = [frame.on_black() for frame in judged]
@@ -175,7 +175,7 @@ def _measured(
         "masked": {
             "psnr": masked.psnr,
             "ssim": masked.ssim,
-            "flip": None,
+            "flip": masked.flip,
             "worst5_psnr": masked.worst5_psnr,
         },
         "mask_iou": mean_mask_iou(judged),
