@@ -83,5 +83,6 @@ def _shaded(
     neighbours = Neighbours(indices, weights)
     normals = (weights[..., None] * state.anchor_normals[indices]).sum(1)
     albedo = avatar.albedo(neighbours)
-    light = avatar.illumination(state.posed.pose.rotations, neighbours, directed, normals)
+    traced = (weights[..., None] * state.light[indices]).sum(1)
+    light = avatar.illumination(state.posed.pose.rotations, neighbours, directed, normals, traced)
     return torch.cat([albedo, light[:, None], normals], dim=-1)

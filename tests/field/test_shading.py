@@ -13,6 +13,8 @@ from handavatar.field.shading import (
 )
 from handavatar.hand.pose import NUM_BONES
 
+NO_LIGHT = torch.zeros(6, 0)
+
 
 def _soft(rays: int = 5, samples: int = 9) -> Tensor:
     generator = torch.Generator().manual_seed(0)
@@ -57,7 +59,11 @@ def test_albedo_and_illumination_are_in_range_and_of_the_papers_sizes() -> None:
     illumination = IlluminationField(torch.rand(50, 3), PaperCues())
     color = albedo(_neighbours())
     light = illumination(
-        torch.zeros(NUM_BONES, 3), _neighbours(), torch.rand(6, NUM_BONES), torch.rand(6, 3)
+        torch.zeros(NUM_BONES, 3),
+        _neighbours(),
+        torch.rand(6, NUM_BONES),
+        torch.rand(6, 3),
+        NO_LIGHT,
     )
     for value in (color.detach(), light.detach()):
         assert 0 <= float(value.min()) <= float(value.max()) <= 1
@@ -76,10 +82,12 @@ def test_light_depends_on_pose_and_shadow() -> None:
     up = torch.tensor([[0.0, 1.0, 0.0]]).expand(6, -1)
     flat = torch.zeros(NUM_BONES, 3)
     clear = torch.zeros(6, NUM_BONES)
-    light = field(flat, there, clear, up)
-    assert not torch.allclose(light, field(flat + 0.5, there, clear, up))
-    assert not torch.allclose(light, field(flat, there, clear + 0.5, up))
-    assert torch.equal(light, field(flat, there, clear, -up)), "the paper's cues hold no normal"
+    light = field(flat, there, clear, up, NO_LIGHT)
+    assert not torch.allclose(light, field(flat + 0.5, there, clear, up, NO_LIGHT))
+    assert not torch.allclose(light, field(flat, there, clear + 0.5, up, NO_LIGHT))
+    assert torch.equal(light, field(flat, there, clear, -up, NO_LIGHT)), (
+        "the paper's cues hold no normal"
+    )
 
 
 def test_oriented_light_depends_on_the_normal_and_a_pose_per_query_is_the_same_pose() -> None:
@@ -88,6 +96,6 @@ def test_oriented_light_depends_on_the_normal_and_a_pose_per_query_is_the_same_p
     flat, clear = torch.zeros(NUM_BONES, 3), torch.zeros(6, NUM_BONES)
     up = torch.tensor([[0.0, 1.0, 0.0]]).expand(6, -1)
     assert field.mlp.hidden[0].in_features == 88
-    light = field(flat, there, clear, up)
-    assert not torch.allclose(light, field(flat, there, clear, -up))
-    assert torch.equal(light, field(flat.expand(6, -1, -1), there, clear, up))
+    light = field(flat, there, clear, up, NO_LIGHT)
+    assert not torch.allclose(light, field(flat, there, clear, -up, NO_LIGHT))
+    assert torch.equal(light, field(flat.expand(6, -1, -1), there, clear, up, NO_LIGHT))

@@ -53,12 +53,14 @@ class Cues:
         places: surface-calibrated positions (interpolated encodings E).
         directed: directed soft occupancy, without gradient.
         normals: world normals of the surface, without gradient.
+        light: cosine times visibility for each direction of light, without gradient.
     """
 
     pose: Float[Tensor, "queries 48"]
     places: Float[Tensor, "queries 21"]
     directed: Float[Tensor, "queries 16"]
     normals: Float[Tensor, "queries 3"]
+    light: Float[Tensor, "queries directions"]
 
 
 class PaperCues:
@@ -69,6 +71,8 @@ class PaperCues:
 
     name = "paper"
     width = 85
+    hidden = (256,) * 4
+    num_directions = 0
 
     def __call__(self, cues: Cues) -> Float[Tensor, "queries 85"]:
         """The network's input."""
@@ -84,10 +88,49 @@ class OrientedCues:
 
     name = "oriented"
     width = 88
+    hidden = (256,) * 4
+    num_directions = 0
 
     def __call__(self, cues: Cues) -> Float[Tensor, "queries 88"]:
         """The network's input."""
         return torch.cat([cues.directed, cues.places, cues.pose, cues.normals], dim=-1)
+
+
+class TracedCues:
+    """What a light in each of many directions would bring, the normal, and the place.
+
+    Departs: the paper looks for what casts shadows along the view ray, so that shadows move with
+        the camera, and must learn from the pose what the light does. Here the posed mesh itself
+        says which part of the sky a place sees (:func:`handavatar.render.skylight.sky_light`), in
+        the world's axes; the network learns how bright each part is, and what comes second hand.
+    """
+
+    name = "traced"
+    hidden = (128,) * 3
+
+    def __init__(self, num_directions: int = 112) -> None:
+        """With so many directions of light; which ones, the field knows."""
+        self.num_directions = num_directions
+        self.width = num_directions + 24
+
+    def __call__(self, cues: Cues) -> Float[Tensor, "queries width"]:
+        """The network's input."""
+        return torch.cat([cues.light, cues.normals, cues.places], dim=-1)
+
+
+CueSet = PaperCues | OrientedCues | TracedCues
+
+
+def cue_set(name: str, num_directions: int) -> CueSet:
+    """The cues of a stored avatar.
+
+    Raises:
+        KeyError: if there are none of that name.
+    """
+    known: dict[str, CueSet] = {
+        part.name: part for part in (PaperCues(), OrientedCues(), TracedCues(num_directions))
+    }
+    return known[name]
 
 
 class IlluminationField(nn.Module):
@@ -97,10 +140,9 @@ class IlluminationField(nn.Module):
     """
 
     position_codes: Tensor
+    directions: Tensor
 
-    def __init__(
-        self, anchor_positions: Float[Tensor, "anchors 3"], chosen: PaperCues | OrientedCues
-    ) -> None:
+    def __init__(self, anchor_positions: Float[Tensor, "anchors 3"], chosen: CueSet) -> None:
         """Fixes the encodings E of the anchors' template positions (metres).
 
         Args:
@@ -110,8 +152,9 @@ class IlluminationField(nn.Module):
         super().__init__()
         centred = (anchor_positions - anchor_positions.mean(0)) / POSITION_SCALE
         self.register_buffer("position_codes", positional_encoding(centred, NUM_FREQUENCIES))
+        self.register_buffer("directions", torch.zeros(chosen.num_directions, 3))
         self.chosen = chosen
-        self.mlp = MLP(chosen.width, 256, 4, 1)
+        self.mlp = MLP(chosen.width, chosen.hidden[0], len(chosen.hidden), 1)
 
     def forward(
         self,
@@ -119,6 +162,7 @@ class IlluminationField(nn.Module):
         neighbours: Neighbours,
         directed: Float[Tensor, "queries bones"],
         normals: Float[Tensor, "queries 3"],
+        light: Float[Tensor, "queries directions"],
     ) -> Float[Tensor, "queries"]:
         """Illumination, in (0, 1).
 
@@ -128,11 +172,12 @@ class IlluminationField(nn.Module):
             neighbours: nearest anchors of the queries.
             directed: directed soft occupancy at the queries, without gradient.
             normals: world normals at the queries.
+            light: what lights in ``directions`` bring; no columns where the cues know none.
 
         Departs: the authors give the wrist's rotation in camera axes, which cannot tell where a
             light that is fixed in the world stands; here it is the world's.
         """
         places = neighbours.interpolated(self.position_codes)
         pose = rotations.flatten(-2).expand(len(places), -1)
-        inputs = self.chosen(Cues(pose, places, directed, normals.detach()))
+        inputs = self.chosen(Cues(pose, places, directed, normals.detach(), light.detach()))
         return self.mlp(inputs)[:, 0].sigmoid()

@@ -28,6 +28,7 @@ class SeenSamples:
         directed: directed soft occupancy at each sample.
         neighbours: nearest anchors of each sample.
         normals: world normal at each sample.
+        light: what a light in each direction brings to each sample; half precision.
         frames: frame number of each sample.
         starts: where each pixel's samples begin; its samples are neighbours in all of the above.
         colors: true colour of each pixel, in [0, 1].
@@ -39,6 +40,7 @@ class SeenSamples:
     directed: Float[Tensor, "samples bones"]
     neighbours: Neighbours
     normals: Float[Tensor, "samples 3"]
+    light: Float[Tensor, "samples directions"]
     frames: Int[Tensor, "samples"]
     starts: Int[Tensor, "pixels_and_one"]
     colors: Float[Tensor, "pixels 3"]
@@ -54,8 +56,8 @@ def find_seen_samples(
 
     Pixels at the hand's border are left out: what they mix with the background is unknown.
     """
-    weights, directed, indices, shares, normals, numbers = [], [], [], [], [], []
-    counts, colors, alphas = [], [], []
+    weights, directed, indices, shares, normals, lights = [], [], [], [], [], []
+    numbers, counts, colors, alphas = [], [], [], []
     for number, frame in enumerate(frames):
         state = avatar.prepare(frame.pose.to(avatar.device))
         camera = frame.camera.to(avatar.device)
@@ -74,6 +76,7 @@ def find_seen_samples(
         indices.append(seen.neighbours.indices[is_kept])
         shares.append(seen.neighbours.weights[is_kept])
         normals.append(seen.neighbours.interpolated(state.anchor_normals)[is_kept])
+        lights.append(seen.neighbours.interpolated(state.light)[is_kept].half())
         numbers.append(torch.full_like(seen.rays[is_kept], number))
         counts.append(torch.bincount(seen.rays, minlength=len(x))[is_covered])
         colors.append(frame.image[y, x].to(alpha)[is_covered] / 255)
@@ -84,12 +87,23 @@ def find_seen_samples(
         torch.cat(directed),
         Neighbours(torch.cat(indices), torch.cat(shares)),
         torch.cat(normals),
+        torch.cat(lights),
         torch.cat(numbers),
         torch.cat([torch.zeros_like(starts[:1]), starts]),
         torch.cat(colors),
         torch.cat(alphas),
         torch.stack([frame.pose.rotations for frame in frames]).to(avatar.device),
     )
+
+
+def chosen_samples(
+    seen: SeenSamples, pixels: Int[Tensor, "pixels"]
+) -> tuple[Int[Tensor, "samples"], Int[Tensor, "samples"]]:
+    """The samples of some pixels, and which of these pixels each belongs to, ascending."""
+    begin, count = seen.starts[pixels], seen.starts[pixels + 1] - seen.starts[pixels]
+    ray = torch.arange(len(pixels), device=pixels.device).repeat_interleave(count)
+    first = count.cumsum(0) - count
+    return begin[ray] + torch.arange(len(ray), device=pixels.device) - first[ray], ray
 
 
 def appearance_loss(
@@ -100,10 +114,7 @@ def appearance_loss(
     Source: paper Sec. 3.3, the l1 term of L_SelF; same volume rendering as everywhere, with
         weights that do not move.
     """
-    begin, count = seen.starts[pixels], seen.starts[pixels + 1] - seen.starts[pixels]
-    ray = torch.arange(len(pixels), device=pixels.device).repeat_interleave(count)
-    first = count.cumsum(0) - count
-    sample = begin[ray] + torch.arange(len(ray), device=pixels.device) - first[ray]
+    sample, ray = chosen_samples(seen, pixels)
     neighbours = Neighbours(seen.neighbours.indices[sample], seen.neighbours.weights[sample])
     albedo = avatar.albedo(neighbours)
     light = avatar.illumination(
@@ -111,6 +122,7 @@ def appearance_loss(
         neighbours,
         seen.directed[sample],
         seen.normals[sample],
+        seen.light[sample].float(),
     )
     color = composite_sparse(seen.weights[sample], ray, albedo * light[:, None], len(pixels))
     color = color / seen.alpha[pixels][:, None]

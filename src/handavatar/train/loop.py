@@ -16,7 +16,7 @@ from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
 from handavatar.capture.view import view_of
 from handavatar.evaluate.metrics import mean_color
 from handavatar.evaluate.perceptual import PerceptualLoss, perceptual_loss
-from handavatar.field.shading import OrientedCues, PaperCues
+from handavatar.field.shading import CueSet, OrientedCues, PaperCues, TracedCues
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.rigs import find_rig
@@ -51,6 +51,7 @@ from handavatar.train.runs import (
     save_checkpoint,
     truncate_log,
 )
+from handavatar.train.sky import place_directions, relit
 from handavatar.train.stopping import Interrupted, stop_signals
 
 
@@ -60,7 +61,8 @@ class Method:
 
     Attributes:
         steps: optimisation steps.
-        cues: what the illumination depends on: the paper's inputs, or these and the normal.
+        cues: what the illumination depends on: the paper's inputs, these and the normal, or light
+            that is traced to the posed mesh.
         outline_rounds: before the first step, the poses of tracked captures and the shape are
             drawn in turn to the outlines of all frames, so many times (``train.outlines``).
         outline_visits: how often the shape sees every frame in one round.
@@ -101,7 +103,7 @@ class Method:
     patch_size: int
     num_samples: int
     silhouette_size: int
-    cues: PaperCues | OrientedCues = field(default_factory=PaperCues)
+    cues: CueSet = field(default_factory=PaperCues)
     outline_rounds: int = 6
     outline_visits: int = 3
     personal_steps: int = 0
@@ -152,6 +154,7 @@ _QUICK = Method(
 )
 METHODS: dict[str, Method] = {
     "quick": _QUICK,
+    "best": replace(_QUICK, cues=TracedCues()),
     # Its rates for the geometry are those of the last steps of all; these are the paper's.
     "joint": replace(_QUICK, warm_steps=0, lr_shape=5e-4, lr_decoder=5e-5, lr_pose=1e-3),
     "paper": Method(
@@ -172,8 +175,8 @@ class TrainOptions:
     Attributes:
         capture: folder of the capture.
         out: run folder; by default ``outputs/{capture}/{method}/{time}``.
-        method: the budget: ``quick`` for two CPU cores and minutes, ``paper`` for the paper's;
-            ``joint`` is ``quick`` with geometry and appearance learned together from the first
+        method: the budget: ``quick`` for two CPU cores and minutes, ``best`` as long with light
+            that is traced instead of guessed, ``paper`` for the paper's; ``joint`` is ``quick`` with geometry and appearance learned together from the first
             step on, for comparison.
         steps: overrides the method's number of steps.
         resume: ``auto`` continues the newest run of this capture and method (or the one at
@@ -188,7 +191,7 @@ class TrainOptions:
 
     capture: Path
     out: Path | None = None
-    method: Literal["quick", "joint", "paper"] = "quick"
+    method: Literal["quick", "best", "joint", "paper"] = "quick"
     steps: int | None = None
     resume: Literal["auto", "never"] = "auto"
     prior: Path = SHIPPED_PRIOR
@@ -245,7 +248,9 @@ def train(options: TrainOptions) -> Path:
         checkpoint = latest_checkpoint(run)
         outlines = _fit_or_restore_outlines(run, checkpoint, training, frames, method, options)
         # Before the checkpoint is loaded: the samples are those of the geometry as it is now.
-        seen = _seen_samples(training, frames, method) if method.warm_steps else None
+        seen = None
+        if method.warm_steps:
+            seen = _seen_samples(training, frames, method, checkpoint, options.seed)
         start = _restore(run, checkpoint, training)
         edges = EdgeSet.of(training.avatar.rig)
         with Progress("train", steps, start) as progress:
@@ -397,10 +402,24 @@ def _outline_modules(training: Training) -> dict[str, torch.nn.Module]:
     return modules
 
 
-def _seen_samples(training: Training, frames: list[Frame], method: Method) -> SeenSamples:
+def _seen_samples(
+    training: Training,
+    frames: list[Frame],
+    method: Method,
+    checkpoint: Checkpoint | None,
+    seed: int,
+) -> SeenSamples:
+    """Found anew; the directions of light are those of the checkpoint, if it has them already."""
+    avatar, corrected = training.avatar, _corrected(training, frames)
     settings = RenderSettings(num_samples=method.num_samples)
-    corrected = _corrected(training, frames)
-    return find_seen_samples(training.avatar, corrected, settings, method.warm_stride)
+    seen = find_seen_samples(avatar, corrected, settings, method.warm_stride)
+    if method.cues.num_directions == 0:
+        return seen
+    if checkpoint is None or checkpoint.step == 0:
+        return place_directions(avatar, corrected, seen, seed)
+    stored = load_checkpoint(checkpoint).tensors["model"]["avatar.illumination.directions"]
+    avatar.illumination.directions.copy_(stored)
+    return relit(avatar, corrected, seen)
 
 
 @torch.no_grad()
