@@ -24,6 +24,7 @@ from handavatar.geometry.rotations import invert_rigid
 from handavatar.hand.rig import Rig
 
 Variant = Literal["auto", "llvm_ad_rgb", "scalar_rgb"]
+Lighting = Literal["key", "dome", "colored"]
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,30 @@ class Lights:
     fill: float = 0.07
     fill_direction: tuple[float, float, float] = (0.1, -0.6, 0.8)
     ambient: float = 0.10
+    key_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """of the light, linear RGB; multiplies its strength"""
+    fill_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    ambient_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
     distance: float = 0.9
     """of both lights from the centre, metres"""
+
+
+LIGHTINGS: dict[Lighting, Lights] = {
+    "key": Lights(),
+    "dome": Lights(key=0.0, fill=0.0, ambient=0.85),
+    "colored": Lights(
+        key=0.62,
+        key_color=(1.0, 0.74, 0.5),
+        fill=0.34,
+        fill_color=(0.42, 0.64, 1.0),
+        ambient=0.12,
+        ambient_color=(0.8, 1.0, 0.85),
+    ),
+}
+"""Key and fill; even light from everywhere; and a warm key, a strong blue fill and a greenish rest,
+under which no scalar is the shading."""
+MAX_DEPTH = {"full": 5, "direct": 2}
+"""Vertices of a light path for all transport, and for light that comes straight from a lamp."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +127,7 @@ class HandTracer:
         center: tuple[float, float, float],
         size: int,
         variant: Variant = "auto",
+        max_depth: int = MAX_DEPTH["full"],
     ) -> None:
         """Builds the scene.
 
@@ -114,6 +138,7 @@ class HandTracer:
             center: metres, world.
             size: width and height of the pictures, pixels.
             variant: of Mitsuba.
+            max_depth: one of ``MAX_DEPTH``.
         """
         self.mi = _mitsuba()
         self.mi.set_variant(choose_variant(variant))
@@ -135,24 +160,26 @@ class HandTracer:
         fan = np.stack([np.roll(np.arange(rim), -1), np.arange(rim), np.full(rim, rim)], axis=-1)
         cap_color = self._rim_color(linear)
         cap = self._mesh("cap", rim + 1, fan, {"type": "rgb", "value": cap_color.tolist()}, None)
-        self.scene = self.mi.load_dict(
-            {
-                "type": "scene",
-                "hand": hand,
-                "cap": cap,
-                "sensor": self._sensor(),
-                "ambient": {
-                    "type": "constant",
-                    "radiance": {"type": "rgb", "value": lights.ambient},
-                },
-                "key": self._panel(
-                    lights.key, lights.key_direction, lights.key_size, lights, center
-                ),
-                "fill": self._panel(lights.fill, lights.fill_direction, 0.6, lights, center),
-            }
-        )
+        ambient = [lights.ambient * part for part in lights.ambient_color]
+        scene = {
+            "type": "scene",
+            "hand": hand,
+            "cap": cap,
+            "sensor": self._sensor(),
+            "ambient": {"type": "constant", "radiance": {"type": "rgb", "value": ambient}},
+        }
+        # A lamp without light would still be asked for its share of the samples.
+        if lights.key:
+            scene["key"] = self._panel(
+                lights.key, lights.key_color, lights.key_direction, lights.key_size, lights, center
+            )
+        if lights.fill:
+            scene["fill"] = self._panel(
+                lights.fill, lights.fill_color, lights.fill_direction, 0.6, lights, center
+            )
+        self.scene = self.mi.load_dict(scene)
         self.params = self.mi.traverse(self.scene)
-        path = {"type": "path", "max_depth": 5, "hide_emitters": True}
+        path = {"type": "path", "max_depth": max_depth, "hide_emitters": True}
         self._path = self.mi.load_dict(path)
         self._maps = self.mi.load_dict(
             {"type": "aov", "aovs": "albedo:albedo,place:position,normal:sh_normal"}
@@ -258,6 +285,7 @@ class HandTracer:
     def _panel(
         self,
         strength: float,
+        color: tuple[float, float, float],
         direction: tuple[float, float, float],
         side: float,
         lights: Lights,
@@ -269,7 +297,8 @@ class HandTracer:
         to_world = self.mi.ScalarTransform4f().look_at(
             origin=origin.tolist(), target=list(center), up=[0.31, 0.47, 0.83]
         )
-        radiance = strength * math.pi * lights.distance**2 / side**2
+        bright = strength * math.pi * lights.distance**2 / side**2
+        radiance = [bright * part for part in color]
         return {
             "type": "rectangle",
             "to_world": to_world @ self.mi.ScalarTransform4f().scale([side / 2, side / 2, 1]),

@@ -16,7 +16,8 @@ The truth beside the frames lies in ``truth/`` in the same stored space as the p
 * ``normals/``: 8 bit, ``(n + 1) / 2``, world axes.
 * ``subject.safetensors``: rest vertices of the subject and of the hand with the same coefficients
   but without the displacement, on the rig subdivided as ``truth.json`` says; shape coefficients.
-* ``truth.json``: all options and the seed.
+* ``truth.json``: all options and the seed, and the PSNR of the pictures against noiseless ones
+  (``noise_psnr``, three test poses traced twice).
 """
 
 import json
@@ -24,6 +25,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -41,8 +43,10 @@ from handavatar.capture.frames import (
 )
 from handavatar.capture.motion import Motion, gesture, placed
 from handavatar.capture.pathtracer import (
+    LIGHTINGS,
+    MAX_DEPTH,
     HandTracer,
-    Lights,
+    Lighting,
     SurfaceMaps,
     Traced,
     Variant,
@@ -84,6 +88,8 @@ TRAINING_GESTURES = (
     "four",
 )
 TEST_GESTURES = ("thumb_to_ring", "three", "gun", "purse", "horns", "shaka", "little_out")
+CONTACT_GESTURES = ("thumb_to_ring", "knock", "purse", "key_grip", "gun", "cupped", "horns")
+"""Fists that training does not have, and fingers that touch."""
 _CAMERA_DISTANCE = 0.6
 _CENTER = (-0.09, 0.0, 0.0)
 _CROP_MARGIN = 1.3
@@ -112,6 +118,14 @@ class SynthOptions:
     """rounds that refine the rig before it is displaced and rendered"""
     texture: int = 1024
     """texels along each side of the skin texture"""
+    lighting: Lighting = "key"
+    """key and fill, even light from everywhere, or lamps of different colours"""
+    transport: Literal["full", "direct"] = "full"
+    """all light, or only what comes straight from the lamps"""
+    contacts: bool = False
+    """the test motion passes through fists and touching fingers"""
+    test_views: int = 1
+    """cameras that take turns in the test motion: the standing one and others around it"""
     geometry_truth: bool = False
     """store depth and normals too, not only albedo and shading"""
     variant: Variant = "auto"
@@ -121,7 +135,8 @@ class SynthOptions:
 
     def __post_init__(self) -> None:
         """Refuses what cannot be rendered."""
-        for name, least in (("train_frames", 1), ("test_frames", 1), ("size", 8), ("samples", 1)):
+        leasts = {"train_frames": 1, "test_frames": 1, "size": 8, "samples": 1, "test_views": 1}
+        for name, least in leasts.items():
             if getattr(self, name) < least:
                 raise CaptureError(
                     f"{name} is {getattr(self, name)}, expected at least {least}", f"raise {name}"
@@ -187,17 +202,23 @@ def make_capture(
     subject = make_subject(subdivided(base, options.subdivisions), options)
     motions = {
         "train": motion_for_training(base, options.train_frames, options.seed),
-        "test": motion_for_testing(base, options.test_frames, options.seed),
+        "test": motion_for_testing(
+            base,
+            options.test_frames,
+            options.seed,
+            CONTACT_GESTURES if options.contacts else TEST_GESTURES,
+        ),
     }
     total = options.train_frames + options.test_frames
     with writer:
-        _write_subject(writer, subject, options)
         pictures = []
         for done, (frame, traced, maps) in enumerate(_frames(subject, motions, options), start=1):
             writer.add(frame)
             _write_truth(writer, frame, traced, maps, options.geometry_truth)
             pictures.append(frame.image)
             on_progress(done, total)
+        noise = _noise(subject, motions["test"], options)
+        _write_subject(writer, subject, options, noise)
         sheet = contact_sheet(pictures[:: max(1, total // 40)])
         Image.fromarray(sheet.numpy()).save(writer.file("overview.png"))
     return read_capture(folder)
@@ -291,11 +312,13 @@ def motion_for_training(rig: Rig, steps: int, seed: int) -> Motion:
     return _turning(rig, fingers, yaw, 32 * _wave(share, 2.6, 0.35), 28 * _wave(share, 5.2, 0.6))
 
 
-def motion_for_testing(rig: Rig, steps: int, seed: int) -> Motion:
+def motion_for_testing(
+    rig: Rig, steps: int, seed: int, gestures: tuple[str, ...] = TEST_GESTURES
+) -> Motion:
     """Other gestures and poses than the training motion's, in similar orientations."""
     generator = torch.Generator().manual_seed(seed + 1000)
     free = sample_poses(rig, 4, generator)
-    keys = [gesture(rig, name) for name in TEST_GESTURES]
+    keys = [gesture(rig, name) for name in gestures]
     for index, pose in enumerate(free):
         keys.insert(3 * index + 1, pose)
     share = torch.linspace(0, 1, steps)
@@ -325,9 +348,18 @@ def _turning(rig: Rig, fingers: Tensor, yaw: Tensor, pitch: Tensor, roll: Tensor
     return placed(rig, fingers, turn_y @ turn_z @ turn_x, middle, fps=10.0)
 
 
-def crop_camera(points: Float[Tensor, "points 3"], size: int) -> Camera:
-    """The standing camera's view of the square around the hand, 1.3 times its box."""
+def crop_camera(points: Float[Tensor, "points 3"], size: int, view: int = 0) -> Camera:
+    """A standing camera's view of the square around the hand, 1.3 times its box.
+
+    View 0 is the one that training sees; the others stand 30 degrees beside, above or below it.
+    """
     eye = torch.tensor(_CENTER) - torch.tensor([0.0, _CAMERA_DISTANCE, 0.0])
+    if view:
+        # The golden angle spreads any number of views around the first.
+        around = torch.tensor((view - 1) * math.pi * (3 - math.sqrt(5)))
+        axis = torch.stack([around.cos(), torch.zeros(()), around.sin()])
+        turn = matrix_from_axis_angle(axis * math.radians(30))
+        eye = torch.tensor(_CENTER) + turn @ (eye - torch.tensor(_CENTER))
     upright = look_at(eye, torch.tensor(_CENTER), torch.tensor([-1.0, 0.0, 0.0]))
     camera = Camera((1000.0, 1000.0), (0.0, 0.0), 1, 1, upright)
     pixels, _ = project(camera, points)
@@ -341,14 +373,13 @@ def crop_camera(points: Float[Tensor, "points 3"], size: int) -> Camera:
 def _frames(
     subject: Subject, motions: dict[str, Motion], options: SynthOptions
 ) -> Iterator[tuple[Frame, Traced, SurfaceMaps]]:
-    tracer = HandTracer(
-        subject.rig, subject.texture, Lights(), _CENTER, options.size, options.variant
-    )
+    tracer = _tracer(subject, options)
     index, time = 0, 0.0
     for split, motion in motions.items():
         for step in range(len(motion)):
             vertices = subject.posed_vertices(motion, step)
-            camera = crop_camera(vertices, options.size)
+            view = step % options.test_views if split == "test" else 0
+            camera = crop_camera(vertices, options.size, view)
             tracer.place(vertices, camera)
             traced = tracer.trace(options.samples, seed=index)
             maps = tracer.surface_maps()
@@ -368,7 +399,38 @@ def _frames(
             index, time = index + 1, time + 1 / motion.fps
 
 
-def _write_subject(writer: CaptureWriter, subject: Subject, options: SynthOptions) -> None:
+def _tracer(subject: Subject, options: SynthOptions) -> HandTracer:
+    return HandTracer(
+        subject.rig,
+        subject.texture,
+        LIGHTINGS[options.lighting],
+        _CENTER,
+        options.size,
+        options.variant,
+        MAX_DEPTH[options.transport],
+    )
+
+
+def _noise(subject: Subject, motion: Motion, options: SynthOptions) -> float:
+    """PSNR of a picture against one without noise, from two of each of three poses, decibels.
+
+    Over pixels that the hand covers; their difference holds the noise of both.
+    """
+    tracer = _tracer(subject, options)
+    squared = []
+    for step in sorted({0, len(motion) // 2, len(motion) - 1}):
+        vertices = subject.posed_vertices(motion, step)
+        tracer.place(vertices, crop_camera(vertices, options.size))
+        first, second = (tracer.trace(options.samples, seed=1_000_000 + k) for k in range(2))
+        covered = (first.alpha > 0.99) & (second.alpha > 0.99)
+        difference = srgb_from_linear(first.color) - srgb_from_linear(second.color)
+        squared.append(difference[covered].square().mean() / 2)
+    return float(-10 * torch.stack(squared).mean().clamp_min(1e-12).log10())
+
+
+def _write_subject(
+    writer: CaptureWriter, subject: Subject, options: SynthOptions, noise: float
+) -> None:
     arrays = {
         "rest_vertices": subject.rest_vertices,
         "plain_vertices": subject.plain_vertices,
@@ -377,7 +439,12 @@ def _write_subject(writer: CaptureWriter, subject: Subject, options: SynthOption
     save_file(
         {k: v.contiguous() for k, v in arrays.items()}, writer.file("truth/subject.safetensors")
     )
-    facts = {"schema": 1, "options": asdict(options), "lights": asdict(Lights())}
+    facts = {
+        "schema": 1,
+        "options": asdict(options),
+        "lights": asdict(LIGHTINGS[options.lighting]),
+        "noise_psnr": round(noise, 2),
+    }
     writer.file("truth/truth.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
 
 

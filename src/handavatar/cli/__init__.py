@@ -20,6 +20,8 @@ COMMANDS: dict[str, Command] = {
     "doctor": default.doctor,
     "capture video": capture.video,
     "capture synth": capture.synth,
+    "capture benchmark": capture.benchmark,
+    "capture degrade": capture.degrade,
     "capture check": capture.check,
     "rig info": rig.info,
     "rig import-mano": rig.import_mano,

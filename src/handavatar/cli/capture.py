@@ -40,6 +40,33 @@ def synth(words: list[str]) -> int:
     return 0
 
 
+def degrade(words: list[str]) -> int:
+    """A worse copy of a capture: tracking noise, mask erosion, blur, JPEG."""
+    from handavatar.capture.degraded import DegradeOptions, degrade_capture
+    from handavatar.cli.arguments import OUT, OVERWRITE, parse_with
+
+    options, extras = parse_with(
+        DegradeOptions, (OUT, OVERWRITE), words, "capture degrade", ("source",)
+    )
+    degrade_capture(extras["out"], options, extras["overwrite"])
+    print(f"capture: {extras['out']}\nnext: handavatar train {extras['out']}")
+    return 0
+
+
+def benchmark(words: list[str]) -> int:
+    """The named made captures with known truth: subjects, lightings, transport, worse ones."""
+    from handavatar.capture.benchmark import BenchmarkOptions, make_benchmark
+    from handavatar.cli.arguments import OUT, parse_with
+    from handavatar.train.progress import Progress
+
+    options, extras = parse_with(BenchmarkOptions, (OUT,), words, "capture benchmark")
+    with Progress("capture benchmark", len(options.names())) as progress:
+        folders = make_benchmark(extras["out"], options, progress.update)
+    for folder in folders:
+        print(f"capture: {folder}")
+    return 0
+
+
 @dataclass(frozen=True)
 class _CheckOptions:
     """Reads a capture completely and names every problem with file, frame and remedy.

@@ -176,8 +176,8 @@ class TrainOptions:
         capture: folder of the capture.
         out: run folder; by default ``outputs/{capture}/{method}/{time}``.
         method: the budget: ``quick`` for two CPU cores and minutes, ``best`` as long with light
-            that is traced instead of guessed, ``paper`` for the paper's; ``joint`` is ``quick`` with geometry and appearance learned together from the first
-            step on, for comparison.
+            that is traced instead of guessed, ``paper`` for the paper's; ``joint`` is ``quick``
+            with geometry and appearance learned together from the first step on, for comparison.
         steps: overrides the method's number of steps.
         resume: ``auto`` continues the newest run of this capture and method (or the one at
             ``out``) if there is one; ``never`` starts anew.
