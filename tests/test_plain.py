@@ -10,7 +10,7 @@ from torch import Tensor
 
 from handavatar.avatar import EXACT, HandAvatar, RayValues, RenderSettings
 from handavatar.evaluate.speed_table import hand_camera
-from handavatar.field.shading import OrientedCues
+from handavatar.field.shading import CueSet, OrientedCues, PaperCues, TracedCues
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
@@ -71,8 +71,8 @@ def test_where_no_hand_is_both_see_nothing(small_avatar: HandAvatar) -> None:
     assert not any(bool(value.any()) for value in vars(values).values())
 
 
-@pytest.mark.parametrize("is_oriented", [False, True])
-def test_random_fields_are_rendered_alike_too(small_avatar: HandAvatar, is_oriented: bool) -> None:
+@pytest.mark.parametrize("cues", [PaperCues(), OrientedCues(), TracedCues(20)])
+def test_random_fields_are_rendered_alike_too(small_avatar: HandAvatar, cues: CueSet) -> None:
     """Half transparent everywhere: no ray ends early, and every sample weighs something."""
     torch.manual_seed(2)
     avatar = HandAvatar(
@@ -80,7 +80,7 @@ def test_random_fields_are_rendered_alike_too(small_avatar: HandAvatar, is_orien
         torch.zeros(10),
         rounds=0,
         num_anchors=64,
-        cues=OrientedCues() if is_oriented else None,
+        cues=cues,
     )
     _assert_alike(avatar, bent_pose(2), camera_above(6))
 
