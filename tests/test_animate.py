@@ -17,7 +17,6 @@ from handavatar.animate import (
     PASSES,
     RenderOptions,
     camera_on,
-    edit_from,
     orbited,
     pass_pictures,
     render_motion,
@@ -25,7 +24,6 @@ from handavatar.animate import (
 )
 from handavatar.avatar import CheckpointError, HandAvatar, Rendering, RenderSettings
 from handavatar.capture.frames import CaptureError
-from handavatar.edit import Edit
 from handavatar.geometry.cameras import project
 from handavatar.hand.pose import HandPose
 
@@ -278,13 +276,6 @@ def test_a_left_hand_is_mirrored_back(small_avatar: HandAvatar) -> None:
         assert (left[name] == right[name][:, ::-1]).all()
         assert left[name].dtype == np.uint8 and left[name].flags["C_CONTIGUOUS"]
     assert (left["rgb"] != right["rgb"]).any()
-
-
-def test_edit_flags_become_an_edit() -> None:
-    assert edit_from(1.0, "0,0,0", "") == Edit()
-    assert edit_from(1.5, "0.1, -0.2,0", "thumb, index1") == Edit(
-        1.5, (0.1, -0.2, 0.0), (13, 14, 15, 1)
-    )
 
 
 def test_the_camera_holds_the_hand_in_every_pose(small_avatar: HandAvatar) -> None:

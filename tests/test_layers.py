@@ -7,8 +7,8 @@ from source_tree import imported_modules, modules
 
 # Left: a folder or top module. Right: what it may import besides itself.
 EVERYTHING_BELOW = (
-    "geometry hand capture field render edit avatar plain processes unfinished alignment animate "
-    "evaluate train export view demo doctor"
+    "geometry hand capture field render edit avatar plain retouch processes unfinished alignment "
+    "animate evaluate train export view demo doctor"
 )
 MAY_IMPORT = {
     name: set(allowed.split())
@@ -18,7 +18,7 @@ MAY_IMPORT = {
         "render": "geometry",
         "capture": "geometry hand render",
         "field": "geometry hand",
-        "edit": "hand",
+        "edit": "hand field",
         "avatar": "geometry hand field render edit",
         # Fits a pose to a mask with any shaped hand.
         "alignment": "geometry hand render",
@@ -28,11 +28,13 @@ MAY_IMPORT = {
         "train": "geometry hand capture field render avatar plain alignment evaluate processes",
         "export": "geometry hand capture edit avatar",
         "view": "geometry hand capture edit avatar",
+        # What words and pictures mean to an avatar.
+        "retouch": "hand capture edit avatar",
         "processes": "",
         "unfinished": "",
         # Motions to pictures: what a viewer may see, the rasteriser's neighbours, and the kernels'
         # names.
-        "animate": "geometry hand capture field render edit avatar processes unfinished",
+        "animate": "geometry hand capture field render edit avatar retouch processes unfinished",
         # The whole road in one call, just under the command line.
         "demo": "geometry hand capture field render edit avatar animate evaluate train",
         "doctor": "hand capture field evaluate train",

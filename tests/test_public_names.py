@@ -29,7 +29,7 @@ EXACTLY = {
     ),
     "hand.rigs": "SCHEMA find_rig load_rig read_rig rigs_folder save_rig",
     "hand.detail": "refined subdivided",
-    "edit": "Edit bones_named",
+    "edit": "Edit Paint bones_named",
     "avatar": (
         "CheckpointError EXACT HandAvatar HandState RayValues RenderSettings Rendering "
         "SCHEMA START_LIGHT VisibleSamples chosen_device"

@@ -22,12 +22,13 @@ from torch import Tensor
 
 from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chosen_device
 from handavatar.capture.motion import MOTIONS, Motion, named_motion, read_motion
-from handavatar.edit import Edit, bones_named
+from handavatar.edit import Edit
 from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.geometry.cameras import Camera, look_at, project
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
 from handavatar.processes import joined_processes
+from handavatar.retouch import Look
 from handavatar.unfinished import UnfinishedFolder
 
 PASSES = ("rgb", "albedo", "illumination", "normal", "depth", "alpha")
@@ -54,6 +55,7 @@ class RenderOptions:
         light_gain: multiplies the illumination.
         albedo_shift: added to the albedo, R,G,B in [-1, 1].
         lift_shadow: fingers or bones that cast no shadow, comma-separated.
+        paint: a picture with transparency (PNG) in the rig's texture chart, laid on the skin.
         overwrite: replace what lies at ``out``.
         device: where the fields run.
         kernel: what decodes pairs of parts; ``triton`` is for NVIDIA GPUs, with ``-tf32`` or
@@ -73,6 +75,7 @@ class RenderOptions:
     light_gain: float = 1.0
     albedo_shift: str = "0,0,0"
     lift_shadow: str = ""
+    paint: Path | None = None
     overwrite: bool = False
     device: str = "auto"
     kernel: Kernel = "torch"
@@ -107,10 +110,12 @@ def render_motion(options: RenderOptions) -> Path:
             raise ValueError(
                 f"--passes: there is no pass '{name}'; choose from {', '.join(PASSES)}"
             )
-    edit = edit_from(options.light_gain, options.albedo_shift, options.lift_shadow)
+    look = Look(options.light_gain, options.albedo_shift, options.lift_shadow, options.paint)
+    look.check()
     device = str(chosen_device(options.device))
     kernel = chosen_kernel(options.kernel, device)
     avatar = HandAvatar.load(options.run)
+    edit = look.on(avatar)
     motion = _chosen_motion(avatar, options.motion)
     poses = [motion.pose(step) for step in _spread(len(motion), options.frames)]
     camera = camera_on(avatar, poses, options.size)
@@ -121,7 +126,8 @@ def render_motion(options: RenderOptions) -> Path:
         views = [orbited(camera, middle, turn) for turn in turns]
     settings = EXACT if options.quality == "exact" else RenderSettings()
     settings = replace(settings, num_samples=options.num_samples, kernel=kernel)
-    folder = UnfinishedFolder(options.out, _what_frames_depend_on(avatar, options, poses, views))
+    facts = _what_frames_depend_on(avatar, edit, options, poses, views)
+    folder = UnfinishedFolder(options.out, facts)
     with joined_processes(device) as processes:
         avatar.moved_to(processes.device)
         try:
@@ -197,12 +203,20 @@ def rendering_error(
 
 
 def _what_frames_depend_on(
-    avatar: HandAvatar, options: RenderOptions, poses: list[HandPose], views: list[Camera]
+    avatar: HandAvatar,
+    edit: Edit,
+    options: RenderOptions,
+    poses: list[HandPose],
+    views: list[Camera],
 ) -> dict[str, Any]:
-    """The options but for where and how often, and a fingerprint of avatar, poses and cameras."""
-    elsewhere = ("run", "motion", "out", "frames", "orbit", "overwrite", "device")
+    """The options but for where and how often; a fingerprint of avatar, look, poses and cameras."""
+    elsewhere = ("run", "motion", "out", "frames", "orbit", "overwrite", "device", "paint")
     digest = sha256()
+    look = avatar.edit.then(edit)
+    digest.update(repr((look.light_gain, look.albedo_shift, look.lifted_bones)).encode())
     tensors = [value for _, value in sorted(avatar.state_dict().items())]
+    if look.paint is not None:
+        tensors += [look.paint.colors, look.paint.opacity]
     tensors += [value for pose in poses for value in (pose.rotations, pose.translation)]
     for value in tensors:
         digest.update(value.detach().cpu().contiguous().numpy().tobytes())
@@ -238,27 +252,6 @@ def _png(pixels: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(pixels).save(buffer, "PNG")
     return buffer.getvalue()
-
-
-def edit_from(light_gain: float, albedo_shift: str, lift_shadow: str) -> Edit:
-    """The edit that the command line's flags describe.
-
-    Raises:
-        ValueError: what cannot be understood.
-    """
-    try:
-        red, green, blue = (float(word) for word in albedo_shift.split(","))
-    except ValueError as error:
-        raise ValueError(
-            f"--albedo-shift {albedo_shift}: expected three numbers, such as 0.1,0,-0.05"
-        ) from error
-    numbers = (light_gain, red, green, blue)
-    if not all(math.isfinite(value) for value in numbers) or light_gain < 0:
-        raise ValueError(
-            "--light-gain and --albedo-shift: expected finite numbers, gain not below 0"
-        )
-    names = tuple(word.strip() for word in lift_shadow.split(",") if word.strip())
-    return Edit(light_gain, (red, green, blue), bones_named(names))
 
 
 def camera_on(avatar: HandAvatar, poses: list[HandPose], size: int) -> Camera:

@@ -18,7 +18,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from handavatar.edit import Edit
+from handavatar.edit import Edit, Paint
 from handavatar.field.anchors import Neighbours, nearest_anchors, place_anchors
 from handavatar.field.kernels import PRECISIONS, Kernel
 from handavatar.field.occupancy import HandCodes, PairItems, PairOccupancy
@@ -56,6 +56,15 @@ def _stored_rig(name: str, tensors: dict[str, Tensor]) -> Rig:
     if "rig.pose_directions" in tensors:
         arrays["pose_directions"] = tensors["rig.pose_directions"]
     return Rig(name=name, vertex_sets=sets, **arrays)
+
+
+def _stored_edit(about: dict[str, Any], tensors: dict[str, Tensor]) -> Edit:
+    red, green, blue = (float(value) for value in about["albedo_shift"])
+    bones = tuple(int(bone) for bone in about["lifted_bones"])
+    paint = None
+    if "paint.colors" in tensors:
+        paint = Paint(tensors["paint.colors"], tensors["paint.opacity"])
+    return Edit(float(about["light_gain"]), (red, green, blue), bones, paint)
 
 
 def chosen_device(name: str) -> torch.device:
@@ -194,7 +203,12 @@ class Rendering:
 
 
 class HandAvatar(nn.Module):
-    """MANO-HD, PairOF and SelF, joined by volume rendering (paper Fig. 2)."""
+    """MANO-HD, PairOF and SelF, joined by volume rendering (paper Fig. 2).
+
+    Attributes:
+        edit: changes of the look that belong to the avatar: they are saved with it, and what
+            rendering is asked for comes on top.
+    """
 
     coefficients: Tensor
     anchor_corners: Tensor
@@ -225,6 +239,7 @@ class HandAvatar(nn.Module):
         self.base_rig = rig
         self.rounds = rounds
         self.info: dict[str, Any] = dict(info or {})
+        self.edit = Edit()
         self.rig, self.parts = finer_rig(rig, rounds)
         # Subdivision keeps the vertices it finds, and refinement gives them weights too.
         skin_weights = self.rig.skin_weights[: rig.num_vertices]
@@ -248,8 +263,9 @@ class HandAvatar(nn.Module):
         return self.coefficients.device
 
     def moved_to(self, device: torch.device | str) -> "HandAvatar":
-        """Moves weights, rig and parts; returns itself."""
+        """Moves weights, rig, parts and paint; returns itself."""
         self.to(device)
+        self.edit = self.edit.to(device)
         self.base_rig = self.base_rig.to(device)
         self.coarse_rig = self.coarse_rig.to(device)
         self.rig = self.rig.to(device)
@@ -313,6 +329,7 @@ class HandAvatar(nn.Module):
     ) -> Float[Tensor, "anchors directions"]:
         """The coarse mesh casts the shadows: on 64 directions its differ by 0.0007 on average."""
         directions = self.illumination.directions
+        lifted_bones = (*self.edit.lifted_bones, *lifted_bones)
         if len(directions) == 0:
             return places.new_zeros(len(places), 0)
         vertices = posed.vertices[: self.coarse_rig.num_vertices].detach()
@@ -348,9 +365,9 @@ class HandAvatar(nn.Module):
         Source: paper Sec. 3.3, Eq. 2, with Eq. 4 along the same samples.
         """
         seen = self.visible_samples(state, rays, settings, generator)
-        edit = edit or Edit()
+        edit = self.edit.then(edit or Edit())
         normals = seen.neighbours.interpolated(state.anchor_normals)
-        albedo = edit.of_albedo(self.albedo(seen.neighbours))
+        albedo = edit.painted(edit.of_albedo(self.albedo(seen.neighbours)), seen.neighbours)
         illumination = edit.of_illumination(
             self.illumination(
                 state.posed.pose.rotations,
@@ -614,6 +631,8 @@ class HandAvatar(nn.Module):
             tensors |= {f"set.{name}": value for name, value in self.base_rig.vertex_sets.items()}
             if self.base_rig.pose_directions.numel():
                 tensors["rig.pose_directions"] = self.base_rig.pose_directions
+        if self.edit.paint is not None:
+            tensors |= {f"paint.{name}": value for name, value in vars(self.edit.paint).items()}
         about = {
             "schema": SCHEMA,
             "rig": self.base_rig.name,
@@ -624,6 +643,11 @@ class HandAvatar(nn.Module):
             "softness": self.occupancy.softness,
             "sharpness": self.occupancy.sharpness,
             "cues": self.illumination.chosen.name,
+            "edit": {
+                "light_gain": self.edit.light_gain,
+                "albedo_shift": self.edit.albedo_shift,
+                "lifted_bones": self.edit.lifted_bones,
+            },
             "info": self.info,
         }
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -687,6 +711,7 @@ class HandAvatar(nn.Module):
             if rig.is_licensed:
                 state |= {name: avatar.state_dict()[name] for name in _OF_LICENSED_RIG}
             avatar.load_state_dict(state)
+            avatar.edit = _stored_edit(about["edit"], tensors)
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
             raise CheckpointError(f"{path}: not a complete avatar ({error})") from error
         return avatar

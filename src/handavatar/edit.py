@@ -1,12 +1,33 @@
 """Edits of a finished avatar's look: a value that rendering takes, no training needed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from handavatar.field.anchors import Neighbours
 from handavatar.hand.pose import BONE_NAMES, FINGER_BONES
+
+
+@dataclass(frozen=True, eq=False)
+class Paint:
+    """Paint on the skin, a spot per anchor; between anchors it runs together.
+
+    Attributes:
+        colors: RGB in [0, 1], as the albedo.
+        opacity: 0 leaves the skin, 1 covers it.
+    """
+
+    colors: Float[Tensor, "anchors 3"]
+    opacity: Float[Tensor, "anchors"]
+
+    def over(self, below: "Paint") -> "Paint":
+        """Both coats as one, this one on top."""
+        hidden = below.opacity * (1 - self.opacity)
+        opacity = self.opacity + hidden
+        mixed = self.colors * self.opacity[:, None] + below.colors * hidden[:, None]
+        return Paint(mixed / opacity.clamp_min(1e-6)[:, None], opacity)
 
 
 @dataclass(frozen=True)
@@ -16,7 +37,9 @@ class Edit:
     Attributes:
         light_gain: multiplies the illumination.
         albedo_shift: added to the albedo, RGB in [-1, 1].
-        lifted_bones: bones that cast no shadow (their directed soft occupancy is set to zero).
+        lifted_bones: bones that cast no shadow: their directed soft occupancy is set to zero, or
+            light is traced to a hand without them.
+        paint: on the skin, over the shifted albedo; None is none.
 
     Source: paper supplement (texture editing).
     """
@@ -24,10 +47,43 @@ class Edit:
     light_gain: float = 1.0
     albedo_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     lifted_bones: tuple[int, ...] = ()
+    paint: Paint | None = None
+
+    def then(self, other: "Edit") -> "Edit":
+        """This edit and another one after it, as one."""
+        red, green, blue = (
+            a + b for a, b in zip(self.albedo_shift, other.albedo_shift, strict=True)
+        )
+        paint = other.paint or self.paint
+        if self.paint is not None and other.paint is not None:
+            paint = other.paint.over(self.paint)
+        return Edit(
+            self.light_gain * other.light_gain,
+            (red, green, blue),
+            tuple(dict.fromkeys((*self.lifted_bones, *other.lifted_bones))),
+            paint,
+        )
+
+    def to(self, device: torch.device | str) -> "Edit":
+        """The same edit with its paint on another device."""
+        if self.paint is None:
+            return self
+        paint = Paint(self.paint.colors.to(device), self.paint.opacity.to(device))
+        return replace(self, paint=paint)
 
     def of_albedo(self, albedo: Float[Tensor, "queries 3"]) -> Float[Tensor, "queries 3"]:
         """Edited albedo, still in [0, 1]."""
         return (albedo + albedo.new_tensor(self.albedo_shift)).clamp(0, 1)
+
+    def painted(
+        self, albedo: Float[Tensor, "queries 3"], neighbours: Neighbours
+    ) -> Float[Tensor, "queries 3"]:
+        """Albedo under the paint of the nearest anchors."""
+        if self.paint is None:
+            return albedo
+        coat = self.paint.colors * self.paint.opacity[:, None]
+        values = neighbours.interpolated(torch.cat([coat, self.paint.opacity[:, None]], dim=-1))
+        return albedo * (1 - values[:, 3:]) + values[:, :3]
 
     def of_illumination(self, illumination: Float[Tensor, "queries"]) -> Float[Tensor, "queries"]:
         """Edited illumination, not clipped above."""

@@ -31,6 +31,7 @@ COMMANDS: dict[str, Command] = {
     "prior picture": prior.picture,
     "train": avatar.train,
     "evaluate": avatar.evaluate,
+    "edit": avatar.edit,
     "bench": bench.bench,
     "render": avatar.render,
 }

@@ -22,6 +22,15 @@ def evaluate(words: list[str]) -> int:
     return 0
 
 
+def edit(words: list[str]) -> int:
+    """Save light, skin colour, paint and lifted shadows into an avatar."""
+    from handavatar.cli.arguments import parse
+    from handavatar.retouch import EditOptions, save_edited
+
+    print(save_edited(parse(EditOptions, words, "edit", positional=("run",))))
+    return 0
+
+
 def render(words: list[str]) -> int:
     """Pictures and video of any pose from any camera."""
     from handavatar.animate import RenderOptions, render_motion

@@ -1,0 +1,153 @@
+"""Edits from words and pictures: what the command line's flags mean, and avatars that keep them."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from handavatar.avatar import HandAvatar
+from handavatar.capture.checks import CaptureError, decoded, open_picture
+from handavatar.edit import Edit, Paint, bones_named
+from handavatar.hand.rig import Rig
+
+
+@dataclass(frozen=True)
+class Look:
+    """An edit as the command line has it.
+
+    Attributes:
+        light_gain: multiplies the illumination.
+        albedo_shift: added to the albedo, R,G,B in [-1, 1].
+        lift_shadow: fingers or bones that cast no shadow, comma-separated.
+        paint: a picture with transparency (PNG) in the rig's texture chart, laid on the skin.
+    """
+
+    light_gain: float = 1.0
+    albedo_shift: str = "0,0,0"
+    lift_shadow: str = ""
+    paint: Path | None = None
+
+    def check(self) -> None:
+        """Refuses words that mean nothing, before anything is read.
+
+        Raises:
+            ValueError: what cannot be understood.
+        """
+        self._shift()
+        self._bones()
+
+    def on(self, avatar: HandAvatar) -> Edit:
+        """The edit of this avatar.
+
+        Raises:
+            ValueError: what cannot be understood.
+            CaptureError: if the picture of the paint cannot be read.
+        """
+        paint = None if self.paint is None else paint_from(self.paint, avatar)
+        return Edit(self.light_gain, self._shift(), self._bones(), paint)
+
+    def _shift(self) -> tuple[float, float, float]:
+        try:
+            red, green, blue = (float(word) for word in self.albedo_shift.split(","))
+        except ValueError as error:
+            raise ValueError(
+                f"--albedo-shift {self.albedo_shift}: expected three numbers, such as 0.1,0,-0.05"
+            ) from error
+        numbers = (self.light_gain, red, green, blue)
+        if not all(math.isfinite(value) for value in numbers) or self.light_gain < 0:
+            raise ValueError(
+                "--light-gain and --albedo-shift: expected finite numbers, gain not below 0"
+            )
+        return red, green, blue
+
+    def _bones(self) -> tuple[int, ...]:
+        words = (word.strip() for word in self.lift_shadow.split(","))
+        return bones_named(tuple(word for word in words if word))
+
+
+@dataclass(frozen=True)
+class EditOptions:
+    """Saves an edit into an avatar: everything that renders it shows it.
+
+    Attributes:
+        run: run folder, or an avatar file; it stays as it is.
+        out: the new avatar file.
+        light_gain: multiplies the illumination.
+        albedo_shift: added to the albedo, R,G,B in [-1, 1].
+        lift_shadow: fingers or bones that cast no shadow, comma-separated.
+        paint: a picture with transparency (PNG) in the rig's texture chart, laid on the skin.
+        overwrite: replace what lies at ``out``.
+    """
+
+    run: Path
+    out: Path
+    light_gain: float = 1.0
+    albedo_shift: str = "0,0,0"
+    lift_shadow: str = ""
+    paint: Path | None = None
+    overwrite: bool = False
+
+
+def save_edited(options: EditOptions) -> Path:
+    """Writes the avatar with the edit on top of those that it has.
+
+    Raises:
+        CheckpointError: if the avatar cannot be read.
+        CaptureError: if the picture of the paint cannot be read, or the file is there already.
+        ValueError: what cannot be understood.
+    """
+    look = Look(options.light_gain, options.albedo_shift, options.lift_shadow, options.paint)
+    look.check()
+    if options.out.exists() and not (options.overwrite and options.out.is_file()):
+        raise CaptureError(f"{options.out} exists", "name another file, or use --overwrite")
+    avatar = HandAvatar.load(options.run)
+    avatar.edit = avatar.edit.then(look.on(avatar))
+    avatar.save(options.out)
+    return options.out
+
+
+def paint_from(path: Path, avatar: HandAvatar) -> Paint:
+    """Paint where a picture in the rig's texture chart is not transparent.
+
+    Row ``i`` and column ``j`` of ``n`` lie at ``v = (i + 0.5) / n`` and ``u = (j + 0.5) / n``.
+    Every anchor takes the pixel that it lies on; finer strokes than anchors are apart
+    (3 to 4 mm) are lost.
+
+    Raises:
+        CaptureError: if the file is no picture, or covers everything or nothing.
+    """
+    picture = open_picture(path)
+    if picture.mode not in ("RGBA", "LA", "PA") and "transparency" not in picture.info:
+        picture.close()
+        raise CaptureError(
+            f"{path.name} has no transparency", "save a PNG that is transparent where skin stays"
+        )
+    pixels = torch.from_numpy(decoded(picture.convert("RGBA"), path.name).astype(np.float32) / 255)
+    places = anchor_places(avatar.rig, avatar.anchor_corners, avatar.anchor_barycentric)
+    size = places.new_tensor([pixels.shape[1], pixels.shape[0]])
+    column, row = (places * size).long().clamp_min(0).minimum(size.long() - 1).unbind(-1)
+    chosen = pixels.to(places.device)[row, column]
+    return Paint(chosen[:, :3], chosen[:, 3])
+
+
+def anchor_places(
+    rig: Rig,
+    corners: Tensor,
+    barycentric: Float[Tensor, "anchors 3"],
+) -> Float[Tensor, "anchors 2"]:
+    """Texture coordinates (u, v) of points on a rig's faces, in [0, 1].
+
+    Args:
+        rig: with a texture chart.
+        corners: vertex indices of the face of each point, as the rig's faces list them.
+        barycentric: weights of the corners.
+    """
+    count = rig.num_vertices
+    scale = torch.tensor([count * count, count, 1], device=corners.device)
+    keys, order = (rig.faces * scale).sum(-1).sort()
+    face = order[torch.searchsorted(keys, (corners * scale).sum(-1))]
+    return (rig.uv_coordinates[rig.uv_faces[face]] * barycentric[..., None]).sum(1)
