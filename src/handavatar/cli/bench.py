@@ -45,7 +45,14 @@ def _training() -> _Bench:
     return _Bench(TrainingTableOptions, training_table)
 
 
+def _ablation() -> _Bench:
+    from handavatar.train.ablation_table import AblationTableOptions, ablation_table
+
+    return _Bench(AblationTableOptions, ablation_table)
+
+
 _TABLES: dict[str, Callable[[], _Bench]] = {
+    "ablation": _ablation,
     "geometry": _geometry,
     "skin": _skin,
     "speed": _speed,
@@ -55,7 +62,7 @@ _TABLES: dict[str, Callable[[], _Bench]] = {
 
 
 def bench(words: list[str]) -> int:
-    """Measure one of the paper's tables: ``bench --table geometry|skin|speed|training``."""
+    """Measure a table: ``bench --table ablation|geometry|skin|speed|training``."""
     from handavatar.cli.arguments import JSON, Extra, parse_with, print_json
     from handavatar.train.progress import Progress
 

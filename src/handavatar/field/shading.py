@@ -79,6 +79,19 @@ class PaperCues:
         return torch.cat([cues.directed, cues.places, cues.pose], dim=-1)
 
 
+class PlainCues:
+    """Place and pose: the paper's illumination without directed occupancy (its ablation)."""
+
+    name = "plain"
+    width = 69
+    hidden = (256,) * 4
+    num_directions = 0
+
+    def __call__(self, cues: Cues) -> Float[Tensor, "queries 69"]:
+        """The network's input."""
+        return torch.cat([cues.places, cues.pose], dim=-1)
+
+
 class OrientedCues:
     """The paper's inputs and the surface's world normal: 88.
 
@@ -118,7 +131,7 @@ class TracedCues:
         return torch.cat([cues.light, cues.normals, cues.places], dim=-1)
 
 
-CueSet = PaperCues | OrientedCues | TracedCues
+CueSet = PaperCues | PlainCues | OrientedCues | TracedCues
 
 
 def cue_set(name: str, num_directions: int) -> CueSet:
@@ -127,10 +140,13 @@ def cue_set(name: str, num_directions: int) -> CueSet:
     Raises:
         KeyError: if there are none of that name.
     """
-    known: dict[str, CueSet] = {
-        part.name: part for part in (PaperCues(), OrientedCues(), TracedCues(num_directions))
-    }
-    return known[name]
+    parts: tuple[CueSet, ...] = (
+        PaperCues(),
+        PlainCues(),
+        OrientedCues(),
+        TracedCues(num_directions),
+    )
+    return {part.name: part for part in parts}[name]
 
 
 class IlluminationField(nn.Module):

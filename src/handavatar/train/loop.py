@@ -63,6 +63,7 @@ class Method:
         steps: optimisation steps.
         cues: what the illumination depends on: the paper's inputs, these and the normal, or light
             that is traced to the posed mesh.
+        corrects_poses: those of tracked captures are learned; the paper takes them as they are.
         outline_rounds: before the first step, the poses of tracked captures and the shape are
             drawn in turn to the outlines of all frames, so many times (``train.outlines``).
         outline_visits: how often the shape sees every frame in one round.
@@ -104,6 +105,7 @@ class Method:
     num_samples: int
     silhouette_size: int
     cues: CueSet = field(default_factory=PaperCues)
+    corrects_poses: bool = True
     outline_rounds: int = 6
     outline_visits: int = 3
     personal_steps: int = 0
@@ -164,6 +166,8 @@ METHODS: dict[str, Method] = {
         patch_size=32,
         num_samples=64,
         silhouette_size=256,
+        corrects_poses=False,
+        outline_rounds=0,
     ),
 }
 
@@ -324,7 +328,8 @@ def begin_training(
         )
     )
     avatar.occupancy.encoder.requires_grad_(False)
-    corrections = PoseCorrections(len(frames)) if capture.is_tracked else None
+    is_corrected = capture.is_tracked and method.corrects_poses
+    corrections = PoseCorrections(len(frames)) if is_corrected else None
     device = chosen_device(options.device)
     avatar.moved_to(device)
     networks = [*avatar.albedo.mlp.parameters(), *avatar.illumination.parameters()]
@@ -361,23 +366,7 @@ def _fit_or_restore_outlines(
     """Sets shape, poses and decoder as the outlines alone would have them, and returns these."""
     modules = _outline_modules(training)
     if checkpoint is None:
-        fit_outlines(
-            training.avatar,
-            training.corrections,
-            frames,
-            method.outline_rounds,
-            method.outline_visits,
-            method.silhouette_size,
-            options.seed,
-        )
-        corrected = _corrected(training, frames)
-        if method.personal_steps:
-            poses = [frame.pose for frame in corrected]
-            fit_occupancy(training.avatar, poses, method.personal_steps, options.seed)
-        training.avatar.occupancy.sharpness = method.sharpness
-        if method.border_steps:
-            settings = learned_rays(method.num_samples)
-            fit_border(training.avatar, corrected, method.border_steps, settings, options.seed)
+        fit_geometry(training, frames, method, options.seed)
         tensors = {
             f"{prefix}{name}": value.clone()
             for prefix, module in modules.items()
@@ -390,6 +379,27 @@ def _fit_or_restore_outlines(
     for prefix, module in modules.items():
         module.load_state_dict(_named(tensors, prefix))
     return tensors
+
+
+def fit_geometry(training: Training, frames: list[Frame], method: Method, seed: int) -> None:
+    """What comes before the first step: shape, poses and decoder, from the masks alone."""
+    fit_outlines(
+        training.avatar,
+        training.corrections,
+        frames,
+        method.outline_rounds,
+        method.outline_visits,
+        method.silhouette_size,
+        seed,
+    )
+    corrected = corrected_frames(training, frames)
+    if method.personal_steps:
+        poses = [frame.pose for frame in corrected]
+        fit_occupancy(training.avatar, poses, method.personal_steps, seed)
+    training.avatar.occupancy.sharpness = method.sharpness
+    if method.border_steps:
+        settings = learned_rays(method.num_samples)
+        fit_border(training.avatar, corrected, method.border_steps, settings, seed)
 
 
 def _outline_modules(training: Training) -> dict[str, torch.nn.Module]:
@@ -410,7 +420,7 @@ def _seen_samples(
     seed: int,
 ) -> SeenSamples:
     """Found anew; the directions of light are those of the checkpoint, if it has them already."""
-    avatar, corrected = training.avatar, _corrected(training, frames)
+    avatar, corrected = training.avatar, corrected_frames(training, frames)
     settings = RenderSettings(num_samples=method.num_samples)
     seen = find_seen_samples(avatar, corrected, settings, method.warm_stride)
     if method.cues.num_directions == 0:
@@ -423,7 +433,7 @@ def _seen_samples(
 
 
 @torch.no_grad()
-def _corrected(training: Training, frames: list[Frame]) -> list[Frame]:
+def corrected_frames(training: Training, frames: list[Frame]) -> list[Frame]:
     """The frames with their poses as training sees them."""
     device = training.avatar.device
     return [

@@ -99,11 +99,13 @@ def fit_outlines(
 
     Departs: the authors start all losses at once.
     """
+    if rounds == 0:
+        return
     generator = torch.Generator().manual_seed(seed)
     edges = EdgeSet.of(avatar.base_rig)
     masks = [soft_mask(frame.alpha, size) for frame in frames]
     optimizer = torch.optim.Adam(avatar.shape.parameters(), lr=_RATE, betas=(0.9, 0.99))
-    passes = rounds * visits + (rounds + 1 if corrections else 0) * (rounds > 0)
+    passes = rounds * visits + (rounds + 1 if corrections else 0)
     steps = rounds * visits * -(-len(frames) // _BATCH)
     falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.1 ** (1 / max(steps, 1)))
     with Progress("outlines", passes * len(frames)) as progress:
@@ -119,7 +121,7 @@ def fit_outlines(
                     falling.step()
                     done += len(chosen)
                     progress.update(done, silhouette=value)
-        if corrections is not None and rounds > 0:
+        if corrections is not None:
             _align(avatar, corrections, frames, progress, done)
     optimizer.zero_grad(set_to_none=True)
 
