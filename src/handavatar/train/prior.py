@@ -56,7 +56,12 @@ SHIPPED_PRIOR = Path(__file__).parent.parent / "assets" / "prior.safetensors"
 3. at commit 7f644f9 ``--start-from B --steps 1200 --lr 5e-4 --final-lr 5e-6 --seed 22`` (Muon);
 4. at commit df72211 ``--start-from C --steps 10000 --lr 6e-4 --final-lr 3e-6 --seed 23``, then
    ``--start-from D --steps 13000 --lr 6e-4 --final-lr 2e-6 --seed 24``: half an hour of one core
-   each, from an IoU of 0.928 to 0.955 and 0.965.
+   each, from an IoU of 0.928 to 0.955 and 0.965;
+5. at commit 223c02d, with both parts of a pair asked at joints, which closed a groove there, four
+   times ``--start-from LAST``: ``--steps 6000 --lr 6e-4 --final-lr 2e-6 --seed 40 --joint-points
+   384``, ``--steps 6500 --lr 6e-4 --final-lr 1e-6 --seed 41 --joint-points 256``, ``--steps 3500
+   --lr 3e-4 --final-lr 1e-6 --seed 42 --joint-points 64``, ``--steps 2500 --lr 6e-5 --final-lr 1e-7
+   --seed 43 --joint-points 64``: an hour of one core.
 """
 EVALUATION_SEED = 1_000_003
 """Evaluation poses come from seeds that training never draws."""
