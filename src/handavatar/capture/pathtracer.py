@@ -128,6 +128,7 @@ class HandTracer:
         size: int,
         variant: Variant = "auto",
         max_depth: int = MAX_DEPTH["full"],
+        hidden_bones: tuple[int, ...] = (),
     ) -> None:
         """Builds the scene.
 
@@ -139,11 +140,15 @@ class HandTracer:
             size: width and height of the pictures, pixels.
             variant: of Mitsuba.
             max_depth: one of ``MAX_DEPTH``.
+            hidden_bones: bones whose skin is left out; the other's shape and normals stay.
         """
         self.mi = _mitsuba()
         self.mi.set_variant(choose_variant(variant))
         self.rig, self.size = rig, size
-        corners = np.stack([rig.faces.numpy().ravel(), rig.uv_faces.numpy().ravel()], axis=-1)
+        owner = rig.skin_weights.argmax(-1)[rig.faces]
+        stays = ~torch.isin(owner, torch.tensor(hidden_bones, dtype=torch.long)).all(-1)
+        faces, uv_faces = rig.faces[stays], rig.uv_faces[stays]
+        corners = np.stack([faces.numpy().ravel(), uv_faces.numpy().ravel()], axis=-1)
         # A vertex on a seam of the chart has several texture coordinates: one copy for each.
         split, which = np.unique(corners, axis=0, return_inverse=True)
         self._source = torch.from_numpy(split[:, 0])

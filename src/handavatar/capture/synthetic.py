@@ -29,7 +29,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from PIL import Image
 from safetensors.torch import save_file
 from torch import Tensor
@@ -94,6 +94,8 @@ _CAMERA_DISTANCE = 0.6
 _CENTER = (-0.09, 0.0, 0.0)
 _CROP_MARGIN = 1.3
 _BACKGROUND = 0.17
+_SAME_DEPTH = 2e-4
+"""Metres: two pictures show the same skin where their depths differ by less."""
 
 
 @dataclass(frozen=True)
@@ -399,7 +401,9 @@ def _frames(
             index, time = index + 1, time + 1 / motion.fps
 
 
-def _tracer(subject: Subject, options: SynthOptions) -> HandTracer:
+def _tracer(
+    subject: Subject, options: SynthOptions, hidden_bones: tuple[int, ...] = ()
+) -> HandTracer:
     return HandTracer(
         subject.rig,
         subject.texture,
@@ -408,6 +412,7 @@ def _tracer(subject: Subject, options: SynthOptions) -> HandTracer:
         options.size,
         options.variant,
         MAX_DEPTH[options.transport],
+        hidden_bones,
     )
 
 
@@ -426,6 +431,41 @@ def _noise(subject: Subject, motion: Motion, options: SynthOptions) -> float:
         difference = srgb_from_linear(first.color) - srgb_from_linear(second.color)
         squared.append(difference[covered].square().mean() / 2)
     return float(-10 * torch.stack(squared).mean().clamp_min(1e-12).log10())
+
+
+def lifted_truth(
+    subject: Subject, frame: Frame, options: SynthOptions, bones: tuple[int, ...], samples: int
+) -> tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]:
+    """A frame's picture without the light that some bones' skin takes or gives.
+
+    Args:
+        subject: whose hand.
+        frame: pose and camera.
+        options: of the capture: lights, transport, size.
+        bones: whose skin is taken away.
+        samples: light paths per pixel.
+
+    Returns:
+        sRGB in [0, 1] on the capture's background, and where it shows the same skin as the frame
+        does: not the bones, and not what they hide.
+    """
+    options = replace(options, size=frame.camera.width)
+    vertices = (
+        replace(subject.rig.shaped(subject.shape_coefficients), rest_vertices=subject.rest_vertices)
+        .posed(frame.pose)
+        .vertices
+    )
+    depths, alphas, picture = [], [], torch.empty(0)
+    for hidden in ((), bones):
+        tracer = _tracer(subject, options, hidden)
+        tracer.place(vertices, frame.camera)
+        traced = tracer.trace(samples, seed=7)
+        depths.append(tracer.surface_maps().depth)
+        alphas.append(traced.alpha)
+        color = traced.color + (1 - traced.alpha[..., None]) * _BACKGROUND**2.2
+        picture = srgb_from_linear(color)
+    is_same = (depths[0] - depths[1]).abs() < _SAME_DEPTH
+    return picture, is_same & (torch.stack(alphas).amin(0) > 0.99)
 
 
 def _write_subject(

@@ -51,9 +51,16 @@ def _ablation() -> _Bench:
     return _Bench(AblationTableOptions, ablation_table)
 
 
+def _lift() -> _Bench:
+    from handavatar.evaluate.lift_table import LiftTableOptions, lift_table
+
+    return _Bench(LiftTableOptions, lift_table)
+
+
 _TABLES: dict[str, Callable[[], _Bench]] = {
     "ablation": _ablation,
     "geometry": _geometry,
+    "lift": _lift,
     "skin": _skin,
     "speed": _speed,
     "training": _training,
@@ -62,7 +69,7 @@ _TABLES: dict[str, Callable[[], _Bench]] = {
 
 
 def bench(words: list[str]) -> int:
-    """Measure a table: ``bench --table ablation|geometry|skin|speed|training``."""
+    """Measure a table: ``bench --table ablation|geometry|lift|skin|speed|training``."""
     from handavatar.cli.arguments import JSON, Extra, parse_with, print_json
     from handavatar.train.progress import Progress
 
