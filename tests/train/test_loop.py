@@ -202,6 +202,19 @@ def test_tracked_poses_are_corrected_and_known_ones_are_not(
     assert not any(name.startswith("corrections.") for name in names)
 
 
+def test_the_papers_method_takes_tracked_poses_as_they_are(tmp_path: Path) -> None:
+    """It has neither the rounds of outlines nor corrections, and its own parts and optimiser."""
+    folder = write_tiny_capture(tmp_path / "tracked", "ab", confidence=0.8)
+    capture = read_capture(folder)
+    frames = [capture.frame(index) for index in capture.split("train")]
+    method = METHODS["paper"]
+    training = begin_training(capture, frames, method, _options(folder, tmp_path / "run"))
+    assert training.corrections is None and training.optimizers.keys() == {"adam"}
+    assert method.outline_rounds == method.personal_steps == method.warm_steps == 0
+    assert training.avatar.illumination.chosen.name == "paper"
+    assert (method.frames * method.patches, method.patch_size, method.num_samples) == (16, 32, 64)
+
+
 # --- interruptions --------------------------------------------------------------------------------
 
 KILLED = """
