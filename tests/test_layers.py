@@ -8,7 +8,7 @@ from source_tree import imported_modules, modules
 # Left: a folder or top module. Right: what it may import besides itself.
 EVERYTHING_BELOW = (
     "geometry hand capture field render edit avatar plain retouch processes unfinished alignment "
-    "animate evaluate train export view demo doctor"
+    "animate evaluate train peers export view demo doctor"
 )
 MAY_IMPORT = {
     name: set(allowed.split())
@@ -24,8 +24,10 @@ MAY_IMPORT = {
         "alignment": "geometry hand render",
         # The slow renderer that the fast one is measured against.
         "plain": "geometry field render avatar",
-        "evaluate": "geometry hand capture avatar alignment plain",
+        "evaluate": "geometry hand capture edit avatar alignment plain",
         "train": "geometry hand capture field render avatar plain alignment evaluate processes",
+        # Prior art, for a table alone.
+        "peers": "geometry hand capture field render avatar evaluate train",
         "export": "geometry hand capture edit avatar",
         "view": "geometry hand capture edit avatar",
         # What words and pictures mean to an avatar.

@@ -57,10 +57,17 @@ def _lift() -> _Bench:
     return _Bench(LiftTableOptions, lift_table)
 
 
+def _peers() -> _Bench:
+    from handavatar.peers.table import PeersTableOptions, peers_table
+
+    return _Bench(PeersTableOptions, peers_table)
+
+
 _TABLES: dict[str, Callable[[], _Bench]] = {
     "ablation": _ablation,
     "geometry": _geometry,
     "lift": _lift,
+    "peers": _peers,
     "skin": _skin,
     "speed": _speed,
     "training": _training,
@@ -69,7 +76,7 @@ _TABLES: dict[str, Callable[[], _Bench]] = {
 
 
 def bench(words: list[str]) -> int:
-    """Measure a table: ``bench --table ablation|geometry|lift|skin|speed|training``."""
+    """Measure a table: ``bench --table ablation|geometry|lift|peers|skin|speed|training``."""
     from handavatar.cli.arguments import JSON, Extra, parse_with, print_json
     from handavatar.train.progress import Progress
 

@@ -258,6 +258,8 @@ class FittedGeometry:
     """What all shadings of one geometry share.
 
     Attributes:
+        avatar: its shape and decoder are fitted, its colours are not.
+        frames: of training, their poses as training sees them.
         anchors: on the template.
         seen: of the training frames.
         views: the test frames.
@@ -266,6 +268,8 @@ class FittedGeometry:
         hidden: share of the sky that the hand itself takes from what each test frame shows.
     """
 
+    avatar: HandAvatar
+    frames: list[Frame]
     anchors: Float[Tensor, "anchors 3"]
     seen: SeenSamples
     views: list[View]
@@ -298,6 +302,8 @@ def fitted_geometry(capture: Capture, shape: Shape, method: Method, seed: int) -
     anchors = SurfacePoints(avatar.anchor_corners, avatar.anchor_barycentric)
     chosen = torch.linspace(0, len(tests) - 1, _TURNED_POSES).round().long().tolist()
     return FittedGeometry(
+        avatar,
+        frames,
         anchors.positions(avatar.rig.template_vertices),
         seen,
         views,
@@ -483,25 +489,11 @@ def judged(
     shading: Shading, geometry: FittedGeometry, capture: Capture
 ) -> tuple[dict[str, list[float]], dict[str, float]]:
     """Figures of every test frame, and figures of the whole."""
-    distance = perceptual_loss("auto")
-    frames: dict[str, list[float]] = {
-        name: [] for name in ("psnr", "ssim", "flip", distance.name, "psnr_paper")
-    }
+    scores = FrameScores()
     albedos, lights, true_albedos, shadings, masks = [], [], [], [], []
     for view in geometry.views:
         picture, frame = shaded_view(shading, view), view.frame
-        pair = JudgedFrame(
-            picture["color"].clamp(0, 1),
-            picture["alpha"] > 0.5,
-            frame.image.float() / 255,
-            frame.alpha,
-        )
-        rendered, truth = pair.on_black()
-        frames["psnr"].append(masked_psnr(pair))
-        frames["ssim"].append(masked_ssim(pair))
-        frames["flip"].append(masked_flip(pair))
-        frames[distance.name].append(float(distance(rendered[None], truth[None])))
-        frames["psnr_paper"].append(paper_scores([pair]).psnr)
+        pair = scores.add(frame, picture["color"], picture["alpha"])
         alpha = picture["alpha"].clamp_min(1e-6)
         albedos.append(picture["albedo"] / alpha[..., None])
         lights.append(picture["light"] / alpha)
@@ -512,7 +504,38 @@ def judged(
     if isinstance(shading, SplitShading):
         whole["shading r"] = shading_correlation(lights, shadings, masks)
         whole["view spread %"] = view_spread(shading, geometry.turned)
-    return frames, whole
+    return scores.by_name, whole
+
+
+class FrameScores:
+    """Figures of pictures, one after the other.
+
+    Attributes:
+        by_name: masked PSNR, SSIM and FLIP, the perceptual metric by its name, and PSNR by the
+            paper's protocol.
+    """
+
+    def __init__(self) -> None:
+        """None yet."""
+        self._distance = perceptual_loss("auto")
+        names = ("psnr", "ssim", "flip", self._distance.name, "psnr_paper")
+        self.by_name: dict[str, list[float]] = {name: [] for name in names}
+
+    def add(
+        self,
+        frame: Frame,
+        color: Float[Tensor, "height width 3"],
+        alpha: Float[Tensor, "height width"],
+    ) -> JudgedFrame:
+        """Judges a picture on black against a frame."""
+        pair = JudgedFrame(color.clamp(0, 1), alpha > 0.5, frame.image.float() / 255, frame.alpha)
+        rendered, truth = pair.on_black()
+        self.by_name["psnr"].append(masked_psnr(pair))
+        self.by_name["ssim"].append(masked_ssim(pair))
+        self.by_name["flip"].append(masked_flip(pair))
+        self.by_name[self._distance.name].append(float(self._distance(rendered[None], truth[None])))
+        self.by_name["psnr_paper"].append(paper_scores([pair]).psnr)
+        return pair
 
 
 def _truth(capture: Capture, kind: str, name: str) -> Tensor:

@@ -1,0 +1,151 @@
+"""``handavatar bench --table peers``: prior art and ours on the same frames and the same hand."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from handavatar.capture.checks import load_json
+from handavatar.capture.frames import read_capture
+from handavatar.evaluate.intervals import mean_interval
+from handavatar.evaluate.tables import Cell, ResultTable, step_counter
+from handavatar.peers.inverse_skinning import fit_inverse_skinning
+from handavatar.peers.textured_mesh import fit_textured_mesh
+from handavatar.train.ablation import (
+    ROWS,
+    FittedGeometry,
+    FrameScores,
+    fitted_geometry,
+    judged,
+    trained_shading,
+)
+from handavatar.train.loop import METHODS
+from handavatar.train.runs import write_json
+
+OURS = {"ours (paper)": "+ directed occupancy (paper)", "ours (best)": "traced light"}
+PEERS = ("textured mesh", "inverse skinning")
+
+
+@dataclass(frozen=True)
+class PeersTableOptions:
+    """What is compared.
+
+    Attributes:
+        captures: folders of captures whose poses are known, comma-separated.
+        kept: folder; what was reached on a capture is kept there as ``peers-CAPTURE.json`` and is
+            not measured again with the same steps and seeds.
+        seeds: of all trainings; geometry is fitted once per capture.
+        steps: of our shadings.
+        peer_steps: of the others.
+    """
+
+    captures: tuple[Path, ...]
+    kept: Path = Path("peers")
+    seeds: tuple[int, ...] = (0, 1, 2)
+    steps: int = 310
+    peer_steps: int = 600
+
+    @property
+    def total_steps(self) -> int:
+        """Rows and seeds of all captures."""
+        return (len(OURS) + len(PEERS)) * len(self.seeds) * len(self.captures)
+
+
+def peers_table(
+    options: PeersTableOptions, report: Callable[[int], None] | None = None
+) -> ResultTable:
+    """Fits everything to every capture, and judges the frames that none has seen.
+
+    Args:
+        options: what to compare.
+        report: told the number of trainings done.
+
+    Raises:
+        CaptureError: if a capture is damaged.
+
+    Source: paper Sec. 4.3, comparison with prior art.
+    """
+    finished = step_counter(report)
+    measured: list[dict[str, Any]] = []
+    about = {
+        "seeds": list(options.seeds),
+        "steps": options.steps,
+        "peer_steps": options.peer_steps,
+    }
+    for folder in options.captures:
+        path = options.kept / f"peers-{folder.name}.json"
+        found = load_json(path) if path.is_file() else {}
+        if {name: found.get(name) for name in about} != about:
+            found = about | {"capture": folder.name, "rows": _measured(folder, options, finished)}
+            found = json.loads(json.dumps(found))
+            options.kept.mkdir(parents=True, exist_ok=True)
+            write_json(path, found)
+        measured.append(found)
+    return _table(measured, options)
+
+
+def _measured(
+    folder: Path, options: PeersTableOptions, finished: Callable[[], None]
+) -> dict[str, dict[str, Any]]:
+    capture, method = read_capture(folder), METHODS["quick"]
+    geometry = fitted_geometry(capture, "personal", method, 0)
+    rows: dict[str, dict[str, Any]] = {}
+    for seed in options.seeds:
+        for name in PEERS:
+            rows.setdefault(name, {})[str(seed)] = _peer_scores(name, geometry, options, seed)
+            finished()
+        for name, part in OURS.items():
+            shading = trained_shading(ROWS[part], geometry, method, options.steps, seed)
+            rows.setdefault(name, {})[str(seed)] = judged(shading, geometry, capture)[0]
+            finished()
+    return rows
+
+
+def _peer_scores(
+    name: str, geometry: FittedGeometry, options: PeersTableOptions, seed: int
+) -> dict[str, list[float]]:
+    avatar, frames, steps = geometry.avatar, geometry.frames, options.peer_steps
+    if name == "textured mesh":
+        picture = fit_textured_mesh(avatar, frames, geometry.color, steps, seed)
+    else:
+        picture = fit_inverse_skinning(avatar, frames, steps, seed)
+    scores = FrameScores()
+    for view in geometry.views:
+        values = picture(view.frame)
+        scores.add(view.frame, values[..., :3], values[..., 3])
+    return scores.by_name
+
+
+def _table(measured: list[dict[str, Any]], options: PeersTableOptions) -> ResultTable:
+    def of_frames(name: str, key: str) -> torch.Tensor:
+        parts = [
+            torch.tensor([values[key] for values in found["rows"][name].values()]).mean(0)
+            for found in measured
+        ]
+        return torch.cat(parts)
+
+    rows: dict[str, dict[str, Cell]] = {}
+    keys = list(next(iter(measured[0]["rows"][PEERS[0]].values())))
+    for name in (*PEERS, *OURS):
+        line: dict[str, Cell] = {
+            key: round(float(of_frames(name, key).mean()), 2 if "psnr" in key else 4)
+            for key in keys
+        }
+        for ours in OURS:
+            text = None
+            if name in PEERS:
+                gain = mean_interval(of_frames(ours, "psnr") - of_frames(name, "psnr"))
+                text = f"{gain.mean:+.2f} [{gain.low:+.2f}, {gain.high:+.2f}]"
+            line[f"{ours} ahead by"] = text
+        rows[name] = line
+    count = len(of_frames(PEERS[0], "psnr"))
+    notes = (
+        f"Captures: {', '.join(found['capture'] for found in measured)}; {count} test frames of "
+        f"poses and cameras never seen, seeds {list(options.seeds)}; {options.steps} steps of ours "
+        f"and {options.peer_steps} of the others on the same frames and the same personal mesh. "
+        "Ahead: masked PSNR, decibels, paired by frame, mean over seeds [95 % over frames].",
+    )
+    return ResultTable("Prior art", rows, notes)

@@ -1,0 +1,145 @@
+"""A personal textured mesh under harmonics of the normal: the idea of HARP and SelfRecon.
+
+The personal mesh of the capture is rasterised, its texture is a colour per texel, and light is a
+function of the normal alone, nine harmonics in the world's axes. Nothing casts a shadow.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from handavatar.avatar import HandAvatar
+from handavatar.capture.frames import Frame
+from handavatar.field.anchors import Neighbours, nearest_anchors
+from handavatar.geometry.meshes import SurfacePoints, sample_surface, vertex_normals
+from handavatar.render.rasterize import interpolate, rasterize
+
+NUM_TEXELS = 30_000
+"""A texel each 1.3 mm: finer than the pictures' pixels."""
+_RAYS = 2
+"""Of a pixel in each direction: the outline is as smooth as ours."""
+_PIXELS, _RATE = 4096, 3e-2
+
+
+class TexturedMesh(nn.Module):
+    """Texture times light."""
+
+    def __init__(self, num_texels: int, color: Float[Tensor, "3"]) -> None:
+        """One colour under even light.
+
+        Args:
+            num_texels: points on the surface that carry a colour.
+            color: mean of the hand's pixels.
+        """
+        super().__init__()
+        start = torch.logit((color / 0.65).clamp(0.05, 0.95))
+        self.texture = nn.Parameter(start.expand(num_texels, 3).clone())
+        light = torch.zeros(9)
+        light[0] = 0.65
+        self.light = nn.Parameter(light)
+
+    def forward(
+        self, neighbours: Neighbours, normals: Float[Tensor, "points 3"]
+    ) -> Float[Tensor, "points 3"]:
+        """Colours in [0, 1] and above."""
+        texture = neighbours.interpolated(self.texture).sigmoid()
+        return texture * (harmonics(normals) @ self.light).clamp_min(0)[:, None]
+
+
+def harmonics(normals: Float[Tensor, "points 3"]) -> Float[Tensor, "points 9"]:
+    """Nine polynomials of the normal that hold diffuse light (Ramamoorthi and Hanrahan 2001)."""
+    x, y, z = normals.unbind(-1)
+    columns = [torch.ones_like(x), x, y, z, x * y, y * z, x * z, x * x - y * y, 3 * z * z - 1]
+    return torch.stack(columns, dim=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPoints:
+    """Surface points behind a picture's rays.
+
+    Attributes:
+        pixels: the pixel of each point; a pixel has up to four.
+        neighbours: nearest texels.
+        normals: unit, world.
+    """
+
+    pixels: Int[Tensor, "points"]
+    neighbours: Neighbours
+    normals: Float[Tensor, "points 3"]
+
+
+@torch.no_grad()
+def mesh_points(avatar: HandAvatar, texels: SurfacePoints, frame: Frame) -> MeshPoints:
+    """Rasterises the personal mesh in the frame's pose."""
+    posed = avatar.personal(frame.pose).posed(frame.pose)
+    camera = frame.camera
+    fine = camera.resized(_RAYS * camera.width, _RAYS * camera.height)
+    fragments = rasterize(posed.vertices, avatar.rig.faces, fine)
+    y, x = fragments.mask.nonzero().unbind(-1)
+    normals = vertex_normals(posed.vertices, avatar.rig.faces)
+    values = torch.cat([posed.vertices, normals], dim=-1)
+    found = interpolate(fragments, avatar.rig.faces, values)[y, x]
+    neighbours = nearest_anchors(texels.positions(posed.vertices), found[:, :3])
+    pixels = (y // _RAYS) * camera.width + x // _RAYS
+    return MeshPoints(pixels, neighbours, nn.functional.normalize(found[:, 3:], dim=-1))
+
+
+def fit_textured_mesh(
+    avatar: HandAvatar, frames: list[Frame], color: Float[Tensor, "3"], steps: int, seed: int
+) -> Callable[[Frame], Float[Tensor, "height width 4"]]:
+    """Fits texture and light to the frames.
+
+    Args:
+        avatar: its personal mesh and nothing else.
+        frames: of training.
+        color: mean of their hand pixels.
+        steps: of Adam.
+        seed: of texels and pixels.
+
+    Returns:
+        Colour on black and coverage of another frame's pose and camera.
+    """
+    torch.manual_seed(seed)
+    generator = torch.Generator().manual_seed(seed)
+    texels = sample_surface(avatar.rig.template_vertices, avatar.rig.faces, NUM_TEXELS, generator)
+    mesh = TexturedMesh(NUM_TEXELS, color)
+    indices, weights, normals, truth = [], [], [], []
+    for frame in frames:
+        points = mesh_points(avatar, texels, frame)
+        image = frame.image.flatten(0, 1)[points.pixels].float() / 255
+        # Pixels that the hand covers in part show background as well.
+        kept = frame.alpha.flatten()[points.pixels] > 0.99
+        indices.append(points.neighbours.indices[kept])
+        weights.append(points.neighbours.weights[kept])
+        normals.append(points.normals[kept])
+        truth.append(image[kept])
+    index, weight, normal, colors = (
+        torch.cat(parts) for parts in (indices, weights, normals, truth)
+    )
+    optimizer = torch.optim.Adam(mesh.parameters(), lr=_RATE)
+    falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.05 ** (1 / max(steps, 1)))
+    for _ in range(steps):
+        chosen = torch.randint(len(colors), (_PIXELS,), generator=generator)
+        found = mesh(Neighbours(index[chosen], weight[chosen]), normal[chosen])
+        loss = (found - colors[chosen]).abs().mean()
+        if not math.isfinite(float(loss.detach())):
+            raise FloatingPointError("textured mesh: the loss is not finite")
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        falling.step()
+
+    @torch.no_grad()
+    def picture(frame: Frame) -> Tensor:
+        points = mesh_points(avatar, texels, frame)
+        values = mesh(points.neighbours, points.normals).clamp(0, 1)
+        values = torch.cat([values, torch.ones_like(values[:, :1])], dim=-1) / _RAYS**2
+        flat = values.new_zeros(frame.camera.height * frame.camera.width, 4)
+        flat.index_add_(0, points.pixels, values)
+        return flat.view(frame.camera.height, frame.camera.width, 4)
+
+    return picture
