@@ -333,12 +333,18 @@ class HandAvatar(nn.Module):
         if len(directions) == 0:
             return places.new_zeros(len(places), 0)
         vertices = posed.vertices[: self.coarse_rig.num_vertices].detach()
+        places, normals = places.detach(), normals.detach()
         faces = self.coarse_rig.faces
         if lifted_bones:
             bones = self.coarse_rig.skin_weights.argmax(-1)[faces]
             lifted = torch.tensor(lifted_bones, device=faces.device)
             faces = faces[~torch.isin(bones, lifted).all(-1)]
-        return sky_light(vertices, faces, places.detach(), normals.detach(), directions)
+        count = torch.get_num_threads() if directions.device.type == "cpu" else 1
+        parts = mapped(
+            lambda part: sky_light(vertices, faces, places, normals, part),
+            directions.tensor_split(count),
+        )
+        return torch.cat(parts, dim=1)
 
     def render_rays(
         self,
