@@ -4,9 +4,11 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from conftest import TINY
+from PIL import Image
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.frames import read_capture
@@ -132,6 +134,11 @@ def test_the_table_is_kept_and_paired(
     table = ablation_table(options, done.append)
     assert done == list(range(1, options.total_steps + 1))
     assert list(table.rows) == list(ROWS)
+    with Image.open(tmp_path / "kept" / "light-key.png") as sheet:
+        assert sheet.size == (48 * (1 + len(ROWS)), 48 * 6)
+        pixels = torch.from_numpy(np.array(sheet)).float()
+    # The first column is the truth: its hands are brighter than what lies around them.
+    assert float(pixels[:48, :48].max()) > 80 and float(pixels[0, 0].max()) == 0
     stored = json.loads((tmp_path / "kept" / "light-key.json").read_text())
     paper = stored["rows"]["+ directed occupancy (paper)"]
     traced = stored["rows"]["traced light"]

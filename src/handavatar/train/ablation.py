@@ -507,6 +507,23 @@ def judged(
     return scores.by_name, whole
 
 
+def _column(shading: Shading, views: list[View]) -> Float[Tensor, "height width 3"]:
+    parts = []
+    for view in views:
+        picture = shaded_view(shading, view)
+        light = picture["light"][..., None].expand(-1, -1, 3)
+        parts += [picture["color"], light]
+    return torch.cat(parts)
+
+
+def _true_column(capture: Capture, frames: list[Frame]) -> Float[Tensor, "height width 3"]:
+    parts = []
+    for frame in frames:
+        shading = _truth(capture, "shading", frame.name)[..., None].expand(-1, -1, 3)
+        parts += [frame.image.float() / 255 * frame.alpha[..., None], shading]
+    return torch.cat(parts)
+
+
 class FrameScores:
     """Figures of pictures, one after the other.
 
@@ -548,6 +565,7 @@ def ablate(
     seeds: tuple[int, ...],
     steps: int,
     finished: Callable[[], None] = lambda: None,
+    pictures: Path | None = None,
 ) -> dict[str, Any]:
     """All rows on one capture, as JSON takes it: ``rows`` by name and seed, ``hidden`` by frame.
 
@@ -556,12 +574,15 @@ def ablate(
         seeds: of the shadings; the geometry is fitted once.
         steps: of each shading.
         finished: called after every row and seed.
+        pictures: a PNG to write: the most open, the middle and the most occluded test frame, truth
+            first and then every row by the first seed, colours above illumination.
     """
     capture, method = read_capture(folder), METHODS["quick"]
     known: dict[Shape, FittedGeometry] = {}
     rows: dict[str, dict[str, Any]] = {}
     begin = time.perf_counter()
     hidden: list[float] = []
+    columns: list[Float[Tensor, "height width 3"]] = []
     for name, row in ROWS.items():
         # Where poses are exact there is nothing to correct.
         shape = row.shape
@@ -571,12 +592,22 @@ def ablate(
             known = {kept: value for kept, value in known.items() if kept == "personal"}
             known[shape] = fitted_geometry(capture, shape, method, 0)
         hidden = known[shape].hidden
+        order = sorted(range(len(hidden)), key=lambda place: hidden[place])
+        shown = [order[0], order[len(order) // 2], order[-1]]
+        if not columns:
+            columns.append(_true_column(capture, [known[shape].views[n].frame for n in shown]))
         rows[name] = {}
         for seed in seeds:
             shading = trained_shading(row, known[shape], method, steps, seed)
             frames, whole = judged(shading, known[shape], capture)
             rows[name][str(seed)] = {"frames": frames, "whole": whole}
+            if seed == seeds[0]:
+                columns.append(_column(shading, [known[shape].views[n] for n in shown]))
             finished()
+    if pictures is not None:
+        pictures.parent.mkdir(parents=True, exist_ok=True)
+        sheet = torch.cat(columns, dim=1).clamp(0, 1)
+        Image.fromarray((sheet * 255).round().byte().numpy()).save(pictures)
     return {
         "capture": folder.name,
         "steps": steps,

@@ -22,7 +22,7 @@ class AblationTableOptions:
     Attributes:
         captures: folders of made captures (``handavatar capture benchmark``), comma-separated.
         kept: folder; what a capture's rows reached is kept there as ``CAPTURE.json`` and is not
-            measured again with the same steps and seeds.
+            measured again with the same steps and seeds; ``CAPTURE.png`` shows three test frames.
         seeds: of the shadings; geometry is fitted once per capture.
         steps: of each shading.
     """
@@ -66,7 +66,8 @@ def ablation_table(
             for _ in range(len(ROWS) * len(options.seeds)):
                 finished()
         else:
-            found = ablate(folder, options.seeds, options.steps, finished)
+            picture = options.kept / f"{folder.name}.png"
+            found = ablate(folder, options.seeds, options.steps, finished, picture)
             found["seeds"] = list(options.seeds)
             found = json.loads(json.dumps(found))
             options.kept.mkdir(parents=True, exist_ok=True)
