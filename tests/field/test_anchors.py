@@ -1,10 +1,12 @@
 """Anchors: nearest neighbours, inverse distance, interpolation."""
 
+import pytest
 import torch
 from torch import Tensor
 
 from handavatar.field.anchors import (
     SMALLEST_DISTANCE,
+    Neighbours,
     inverse_distance_weights,
     nearest_anchors,
     place_anchors,
@@ -18,6 +20,14 @@ def _scene() -> tuple[Tensor, Tensor]:
         0.1 * torch.randn(500, 3, generator=generator),
         0.1 * torch.randn(40, 3, generator=generator),
     )
+
+
+@pytest.mark.parametrize("count", [0, 1, 100_000])
+def test_no_channels_are_interpolated_to_no_channels(count: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    indices = torch.randint(4096, (count, 4), generator=generator)
+    neighbours = Neighbours(indices, torch.full((count, 4), 0.25))
+    assert neighbours.interpolated(torch.zeros(4096, 0)).shape == (count, 0)
 
 
 def test_neighbours_and_weights_agree_with_a_full_search() -> None:

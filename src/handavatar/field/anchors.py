@@ -35,6 +35,9 @@ class Neighbours:
 
         Source: paper Sec. 3.3 (albedo field), the interpolation of A and E.
         """
+        if values.shape[1] == 0:
+            # Torch's operation refuses rows without columns.
+            return values.new_zeros(len(self.indices), 0)
         return torch.nn.functional.embedding_bag(
             self.indices, values, per_sample_weights=self.weights, mode="sum"
         )
