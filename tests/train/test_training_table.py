@@ -19,7 +19,7 @@ def test_training_is_cheaper_and_has_the_same_gradient(
     sharp.occupancy.sharpness = 3.0  # As it is trained.
     sharp.save(tmp_path / "avatar.safetensors")
     options = TrainingTableOptions(
-        tmp_path / "avatar.safetensors", patch=8, plain_rays=32, steps=1, points=128
+        tmp_path / "avatar.safetensors", patch=32, plain_rays=32, steps=1, points=128
     )
     told: list[int] = []
     table = training_table(options, told.append)
