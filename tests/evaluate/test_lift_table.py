@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,7 @@ from handavatar.capture.checks import CaptureError
 from handavatar.capture.frames import Capture, read_capture
 from handavatar.capture.synthetic import (
     SynthOptions,
-    lifted_truth,
+    lifted_truths,
     make_capture,
     make_subject,
 )
@@ -39,14 +40,14 @@ def test_without_a_finger_its_skin_is_gone_and_what_it_shaded_is_brighter(
     subject = make_subject(subdivided(load_open_hand(), 1), TINY)
     frame = capture.frame(1)
     before = frame.image.float() / 255
-    picture, is_same = lifted_truth(subject, frame, TINY, bones_named(("thumb",)), 64)
+    picture, is_same = next(lifted_truths(subject, [frame], TINY, bones_named(("thumb",)), 64))
     assert 0.4 * float(frame.mask.sum()) < float(is_same.sum()) < float(frame.mask.sum())
     change = (picture - before)[is_same].mean(-1)
     # Noise of 64 paths is well below this; light that the thumb sent is lost in few places.
     assert float((change > 0.04).float().mean()) > 0.005
     assert float((change < -0.04).float().mean()) < 0.5 * float((change > 0.04).float().mean())
     # Nothing lifted: the same skin everywhere, and the same picture up to noise.
-    picture, is_same = lifted_truth(subject, frame, TINY, (), 64)
+    picture, is_same = next(lifted_truths(subject, [frame], TINY, (), 64))
     assert int(is_same.sum()) > 0.9 * int((frame.coverage > 253).sum())
     assert float((picture - before)[is_same].abs().mean()) < 0.02
 
@@ -62,6 +63,11 @@ def test_the_table_judges_every_avatar_where_the_shadow_falls(
     table = lift_table(options, done.append)
     assert done == list(range(1, options.total_steps + 1))
     assert list(table.rows) == ["thumb: a.safetensors", "middle+ring: a.safetensors"]
+    (tmp_path / "b").mkdir()
+    small_avatar.save(tmp_path / "b" / "a.safetensors")
+    twins = (*options.avatars, tmp_path / "b" / "a.safetensors")
+    both = lift_table(replace(options, avatars=twins, lift=("thumb",), frames=1))
+    assert list(both.rows) == [f"thumb: {path}" for path in twins], "none is lost"
     row = table.rows["thumb: a.safetensors"]
     assert row["frames"] in (1, 2) and isinstance(row["lifted"], float)
 

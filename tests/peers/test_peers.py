@@ -118,7 +118,6 @@ def test_the_table_is_kept_and_has_every_row(
     tiny_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from handavatar.peers import table
-    from handavatar.train.ablation import fitted_geometry
 
     monkeypatch.setitem(METHODS, "quick", replace(TINY, cues=TracedCues()))
     monkeypatch.setattr(textured_mesh, "NUM_TEXELS", 500)
@@ -133,7 +132,6 @@ def test_the_table_is_kept_and_has_every_row(
     assert str(found.rows["inverse skinning"]["ours (best) ahead by"]).count("[") == 1
     monkeypatch.setattr(table, "fitted_geometry", None)
     assert peers_table(options) == found
-    assert fitted_geometry is not None
 
 
 def _scores(geometry: object) -> dict[str, list[float]]:

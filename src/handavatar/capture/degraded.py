@@ -117,9 +117,8 @@ def _degraded(frame: Frame, options: DegradeOptions, random: np.random.Generator
         picture = Image.open(stream)
     coverage = frame.coverage.numpy()
     if options.mask_erosion:
-        disc = np.hypot(*np.mgrid[-64:65, -64:65]) <= options.mask_erosion
-        disc = disc[64 - options.mask_erosion : 65 + options.mask_erosion]
-        disc = disc[:, 64 - options.mask_erosion : 65 + options.mask_erosion]
+        reach = options.mask_erosion
+        disc = np.hypot(*np.mgrid[-reach : reach + 1, -reach : reach + 1]) <= reach
         coverage = np.where(binary_erosion(coverage > 127, disc), 255, 0).astype(np.uint8)
     return Frame(
         name=frame.name,

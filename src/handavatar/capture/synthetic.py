@@ -58,7 +58,7 @@ from handavatar.geometry.colors import srgb_from_linear
 from handavatar.geometry.meshes import uniform_laplacian, unique_edges, vertex_normals
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.detail import subdivided
-from handavatar.hand.pose import FINGER_BONES
+from handavatar.hand.pose import FINGER_BONES, HandPose
 from handavatar.hand.pose_sampling import (
     interpolate_rotations,
     resolve_penetration,
@@ -165,10 +165,10 @@ class Subject:
     rest_vertices: Float[Tensor, "vertices 3"]
     texture: Float[Tensor, "rows columns 3"]
 
-    def posed_vertices(self, motion: Motion, step: int) -> Float[Tensor, "vertices 3"]:
+    def posed_vertices(self, pose: HandPose) -> Float[Tensor, "vertices 3"]:
         """Skin in the world. The joints are those of the shape coefficients."""
         shaped = self.rig.shaped(self.shape_coefficients)
-        return replace(shaped, rest_vertices=self.rest_vertices).posed(motion.pose(step)).vertices
+        return replace(shaped, rest_vertices=self.rest_vertices).posed(pose).vertices
 
 
 def make_capture(
@@ -379,7 +379,7 @@ def _frames(
     index, time = 0, 0.0
     for split, motion in motions.items():
         for step in range(len(motion)):
-            vertices = subject.posed_vertices(motion, step)
+            vertices = subject.posed_vertices(motion.pose(step))
             view = step % options.test_views if split == "test" else 0
             camera = crop_camera(vertices, options.size, view)
             tracer.place(vertices, camera)
@@ -424,7 +424,7 @@ def _noise(subject: Subject, motion: Motion, options: SynthOptions) -> float:
     tracer = _tracer(subject, options)
     squared = []
     for step in sorted({0, len(motion) // 2, len(motion) - 1}):
-        vertices = subject.posed_vertices(motion, step)
+        vertices = subject.posed_vertices(motion.pose(step))
         tracer.place(vertices, crop_camera(vertices, options.size))
         first, second = (tracer.trace(options.samples, seed=1_000_000 + k) for k in range(2))
         covered = (first.alpha > 0.99) & (second.alpha > 0.99)
@@ -433,39 +433,37 @@ def _noise(subject: Subject, motion: Motion, options: SynthOptions) -> float:
     return float(-10 * torch.stack(squared).mean().clamp_min(1e-12).log10())
 
 
-def lifted_truth(
-    subject: Subject, frame: Frame, options: SynthOptions, bones: tuple[int, ...], samples: int
-) -> tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]:
-    """A frame's picture without the light that some bones' skin takes or gives.
+def lifted_truths(
+    subject: Subject,
+    frames: list[Frame],
+    options: SynthOptions,
+    bones: tuple[int, ...],
+    samples: int,
+) -> Iterator[tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]]:
+    """Frames' pictures without the light that some bones' skin takes or gives.
 
     Args:
         subject: whose hand.
-        frame: pose and camera.
+        frames: of one made capture: poses and cameras.
         options: of the capture: lights, transport, size.
         bones: whose skin is taken away.
         samples: light paths per pixel.
 
-    Returns:
+    Yields:
         sRGB in [0, 1] on the capture's background, and where it shows the same skin as the frame
         does: not the bones, and not what they hide.
     """
-    options = replace(options, size=frame.camera.width)
-    vertices = (
-        replace(subject.rig.shaped(subject.shape_coefficients), rest_vertices=subject.rest_vertices)
-        .posed(frame.pose)
-        .vertices
-    )
-    depths, alphas, picture = [], [], torch.empty(0)
-    for hidden in ((), bones):
-        tracer = _tracer(subject, options, hidden)
-        tracer.place(vertices, frame.camera)
-        traced = tracer.trace(samples, seed=7)
-        depths.append(tracer.surface_maps().depth)
-        alphas.append(traced.alpha)
+    whole, rest = _tracer(subject, options), _tracer(subject, options, bones)
+    for frame in frames:
+        vertices = subject.posed_vertices(frame.pose)
+        for tracer in (whole, rest):
+            tracer.place(vertices, frame.camera)
+        traced = rest.trace(samples, seed=7)
         color = traced.color + (1 - traced.alpha[..., None]) * _BACKGROUND**2.2
-        picture = srgb_from_linear(color)
-    is_same = (depths[0] - depths[1]).abs() < _SAME_DEPTH
-    return picture, is_same & (torch.stack(alphas).amin(0) > 0.99)
+        depth = rest.surface_maps().depth
+        is_same = (whole.surface_maps().depth - depth).abs() < _SAME_DEPTH
+        is_covered = (frame.alpha > 0.99) & (traced.alpha > 0.99)
+        yield srgb_from_linear(color), is_same & is_covered
 
 
 def _write_subject(

@@ -21,6 +21,10 @@ class Interval:
     low: float
     high: float
 
+    def of_difference(self) -> str:
+        """As tables print a difference: signed, with its borders in brackets."""
+        return f"{self.mean:+.2f} [{self.low:+.2f}, {self.high:+.2f}]"
+
 
 def mean_interval(samples: Float[Tensor, "samples"], level: float = 0.95) -> Interval:
     """Student's interval of the mean of independent samples, two-sided.

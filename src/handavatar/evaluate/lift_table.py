@@ -15,7 +15,7 @@ from torch import Tensor
 from handavatar.avatar import HandAvatar
 from handavatar.capture.checks import CaptureError, load_json
 from handavatar.capture.frames import Capture, Frame, read_capture
-from handavatar.capture.synthetic import Subject, SynthOptions, lifted_truth, make_subject
+from handavatar.capture.synthetic import Subject, SynthOptions, lifted_truths, make_subject
 from handavatar.edit import Edit, bones_named
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.metrics import psnr
@@ -87,25 +87,34 @@ def lift_table(
     groups = {name: bones_named(tuple(name.split("+"))) for name in options.lift}
     capture = read_capture(options.capture)
     subject, made = _subject(capture)
-    avatars = {str(path): HandAvatar.load(path) for path in options.avatars}
+    avatars = {path: HandAvatar.load(path) for path in options.avatars}
+    names = [path.name for path in avatars]
+    # Two runs may end in the same word; then their whole paths tell them apart.
+    labels = {path: path.name if names.count(path.name) == 1 else str(path) for path in avatars}
     finished = step_counter(report)
     test = capture.split("test")
     places = torch.linspace(0, len(test) - 1, min(options.frames, len(test))).round().long()
-    rows: dict[str, dict[str, Cell]] = {}
+    frames = [capture.frame(test[place]) for place in places.tolist()]
+    truths: dict[str, list[LiftedFrame]] = {}
     for name, bones in groups.items():
-        truths = []
-        for place in places.tolist():
-            frame = capture.frame(test[place])
-            picture, is_same = lifted_truth(subject, frame, made, bones, options.samples)
+        truths[name] = []
+        pictures = lifted_truths(subject, frames, made, bones, options.samples)
+        for frame, (picture, is_same) in zip(frames, pictures, strict=True):
             before = frame.image.float() / 255
             is_changed = is_same & ((picture - before).abs().amax(-1) > CHANGED)
-            truths.append(LiftedFrame(frame, picture, is_changed))
+            truths[name].append(LiftedFrame(frame, picture, is_changed))
             finished()
-        truths = [truth for truth in truths if int(truth.is_changed.sum()) >= _FEWEST]
-        for path, avatar in avatars.items():
-            rows[f"{name}: {Path(path).name}"] = _judged(avatar, truths, bones)
-            for _ in places:
+    rows: dict[str, dict[str, Cell]] = {}
+    for path, avatar in avatars.items():
+        # As it is, once for all that is lifted.
+        plain = [avatar.render(frame.pose, frame.camera).color.clamp(0, 1) for frame in frames]
+        for name, bones in groups.items():
+            rows[f"{name}: {labels[path]}"] = _judged(avatar, plain, truths[name], bones)
+            for _ in frames:
                 finished()
+    rows = {
+        f"{name}: {label}": rows[f"{name}: {label}"] for name in groups for label in labels.values()
+    }
     notes = (
         f"{options.capture.name}, {len(places)} test frames; PSNR over the pixels that the shadow "
         f"darkens or brightens by more than {CHANGED * 255:.0f}/255 in truth (frames with fewer "
@@ -116,23 +125,26 @@ def lift_table(
 
 
 def _judged(
-    avatar: HandAvatar, truths: list[LiftedFrame], bones: tuple[int, ...]
+    avatar: HandAvatar,
+    plain: list[Float[Tensor, "height width 3"]],
+    truths: list[LiftedFrame],
+    bones: tuple[int, ...],
 ) -> dict[str, Cell]:
     lifted, left, unedited = [], [], []
-    for truth in truths:
+    for truth, picture in zip(truths, plain, strict=True):
         frame, where = truth.frame, truth.is_changed
-        plain = avatar.render(frame.pose, frame.camera).color.clamp(0, 1)
+        if int(where.sum()) < _FEWEST:
+            continue
         edit = Edit(lifted_bones=bones)
         edited = avatar.render(frame.pose, frame.camera, edit).color.clamp(0, 1)
         lifted.append(psnr(edited[where], truth.lifted[where]))
-        left.append(psnr(plain[where], truth.lifted[where]))
-        unedited.append(psnr(plain[where], frame.image.float()[where] / 255))
+        left.append(psnr(picture[where], truth.lifted[where]))
+        unedited.append(psnr(picture[where], frame.image.float()[where] / 255))
     gain: str | None = None
-    if len(truths) > 1:
-        found = mean_interval(torch.tensor(lifted) - torch.tensor(left))
-        gain = f"{found.mean:+.2f} [{found.low:+.2f}, {found.high:+.2f}]"
+    if len(lifted) > 1:
+        gain = mean_interval(torch.tensor(lifted) - torch.tensor(left)).of_difference()
     return {
-        "frames": len(truths),
+        "frames": len(lifted),
         "lifted": _mean(lifted),
         "left as it is": _mean(left),
         "gain": gain,

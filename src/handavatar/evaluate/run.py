@@ -80,7 +80,7 @@ def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
     for frame in frames:
         pose = frame.pose
         if is_tracked:
-            pose = _aligned(avatar, frame)
+            pose = held_out_pose(avatar, frame)
         rendering = _on_cpu(avatar.render(pose, frame.camera))
         renderings.append(rendering)
         judged.append(
@@ -98,7 +98,7 @@ def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
     return metrics
 
 
-def _aligned(avatar: HandAvatar, frame: Frame) -> HandPose:
+def held_out_pose(avatar: HandAvatar, frame: Frame) -> HandPose:
     """Training corrects the poses of its own frames; held-out frames get the same chance."""
     device = avatar.device
     return aligned_pose(
@@ -195,7 +195,7 @@ def _against_truth(
         files = [capture.folder / "truth" / kind / f"{frame.name}.png" for kind in _TRUTH]
         if not all(file.is_file() for file in files):
             return None
-        albedo, shading = (_float_image(file) for file in files)
+        albedo, shading = (float_image(file) for file in files)
         mask = frame.mask & (rendering.alpha > 0.5)
         albedos.append(rendering.albedo / rendering.alpha.clamp_min(1e-6)[..., None])
         lights.append(rendering.illumination / rendering.alpha.clamp_min(1e-6))
@@ -211,7 +211,8 @@ def _against_truth(
 _TRUTH = ("albedo", "shading")
 
 
-def _float_image(file: Path) -> Tensor:
+def float_image(file: Path) -> Tensor:
+    """A picture's values in [0, 1], as stored."""
     with Image.open(file) as image:
         return torch.from_numpy(np.asarray(image).astype(np.float32) / 255)
 

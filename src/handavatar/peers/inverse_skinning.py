@@ -5,7 +5,6 @@ moved a little by a network of the pose, and looked up in a field that knows col
 together. Shape, skin and light are one thing.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -22,6 +21,7 @@ from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import SurfacePoints
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, ShapedHand
+from handavatar.peers.descent import descend
 from handavatar.render.rasterize import rasterize
 from handavatar.render.volume import composite_sparse, visibility
 
@@ -31,7 +31,7 @@ NUM_SAMPLES = 64
 _FREQUENCIES = 6
 _MARGIN = 6
 """Pixels around the mesh that are looked at."""
-_PIXELS, _RATE = 1536, 2e-3
+_FRAMES, _PIXELS, _RATE = 8, 1536, 2e-3
 _DENSITY_SCALE = 500.0
 """Per metre and unit of the network: a millimetre of flesh hides two fifths of what is behind."""
 
@@ -174,15 +174,12 @@ def fit_inverse_skinning(
     torch.manual_seed(seed)
     field, generator = CanonicalField(), torch.Generator().manual_seed(seed)
     known = [ray_samples(avatar, frame, stride) for frame in frames]
-    optimizer = torch.optim.Adam(field.parameters(), lr=_RATE)
-    falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.05 ** (1 / max(steps, 1)))
-    share = max(1, _PIXELS // 8)
-    for _ in range(steps):
-        # Pixels of eight frames at a time.
-        chosen = torch.randint(len(frames), (8,), generator=generator).tolist()
+
+    def loss() -> Tensor:
+        chosen = torch.randint(len(frames), (_FRAMES,), generator=generator).tolist()
         parts, poses, truths = [], [], []
         for number in chosen:
-            part = some_rays(known[number], share, generator)
+            part = some_rays(known[number], _PIXELS // _FRAMES, generator)
             frame = frames[number]
             parts.append(part)
             poses.append(_rotations(frame.pose, len(part.places)))
@@ -190,13 +187,9 @@ def fit_inverse_skinning(
             image = frame.image.flatten(0, 1)[part.pixels].float() / 255
             truths.append(torch.cat([image * coverage, coverage], dim=-1))
         found = seen_along(field, joined(parts), torch.cat(poses))
-        loss = (found - torch.cat(truths)).abs().mean()
-        if not math.isfinite(float(loss.detach())):
-            raise FloatingPointError("inverse skinning: the loss is not finite")
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        falling.step()
+        return (found - torch.cat(truths)).abs().mean()
+
+    descend(field, loss, steps, _RATE)
 
     @torch.no_grad()
     def picture(frame: Frame) -> Tensor:

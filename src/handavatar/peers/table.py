@@ -78,7 +78,10 @@ def peers_table(
     for folder in options.captures:
         path = options.kept / f"peers-{folder.name}.json"
         found = load_json(path) if path.is_file() else {}
-        if {name: found.get(name) for name in about} != about:
+        if {name: found.get(name) for name in about} == about:
+            for _ in range((len(OURS) + len(PEERS)) * len(options.seeds)):
+                finished()
+        else:
             found = about | {"capture": folder.name, "rows": _measured(folder, options, finished)}
             found = json.loads(json.dumps(found))
             options.kept.mkdir(parents=True, exist_ok=True)
@@ -137,8 +140,8 @@ def _table(measured: list[dict[str, Any]], options: PeersTableOptions) -> Result
         for ours in OURS:
             text = None
             if name in PEERS:
-                gain = mean_interval(of_frames(ours, "psnr") - of_frames(name, "psnr"))
-                text = f"{gain.mean:+.2f} [{gain.low:+.2f}, {gain.high:+.2f}]"
+                ahead = of_frames(ours, "psnr") - of_frames(name, "psnr")
+                text = mean_interval(ahead).of_difference()
             line[f"{ours} ahead by"] = text
         rows[name] = line
     count = len(of_frames(PEERS[0], "psnr"))

@@ -4,7 +4,6 @@ The personal mesh of the capture is rasterised, its texture is a colour per texe
 function of the normal alone, nine harmonics in the world's axes. Nothing casts a shadow.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -16,6 +15,7 @@ from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
 from handavatar.field.anchors import Neighbours, nearest_anchors
 from handavatar.geometry.meshes import SurfacePoints, sample_surface, vertex_normals
+from handavatar.peers.descent import descend
 from handavatar.render.rasterize import interpolate, rasterize
 
 NUM_TEXELS = 30_000
@@ -120,18 +120,13 @@ def fit_textured_mesh(
     index, weight, normal, colors = (
         torch.cat(parts) for parts in (indices, weights, normals, truth)
     )
-    optimizer = torch.optim.Adam(mesh.parameters(), lr=_RATE)
-    falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.05 ** (1 / max(steps, 1)))
-    for _ in range(steps):
+
+    def loss() -> Tensor:
         chosen = torch.randint(len(colors), (_PIXELS,), generator=generator)
         found = mesh(Neighbours(index[chosen], weight[chosen]), normal[chosen])
-        loss = (found - colors[chosen]).abs().mean()
-        if not math.isfinite(float(loss.detach())):
-            raise FloatingPointError("textured mesh: the loss is not finite")
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        falling.step()
+        return (found - colors[chosen]).abs().mean()
+
+    descend(mesh, loss, steps, _RATE)
 
     @torch.no_grad()
     def picture(frame: Frame) -> Tensor:

@@ -10,16 +10,15 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from PIL import Image
 from torch import Tensor, nn
 
-from handavatar.alignment import aligned_pose
 from handavatar.avatar import START_LIGHT, HandAvatar, HandState, RenderSettings
 from handavatar.capture.frames import Capture, Frame, read_capture
 from handavatar.capture.synthetic import crop_camera
@@ -33,7 +32,8 @@ from handavatar.evaluate.metrics import (
     paper_scores,
     shading_correlation,
 )
-from handavatar.evaluate.perceptual import perceptual_loss
+from handavatar.evaluate.perceptual import PerceptualLoss, perceptual_loss
+from handavatar.evaluate.run import float_image, held_out_pose
 from handavatar.field.anchors import Neighbours
 from handavatar.field.layers import MLP
 from handavatar.field.shading import (
@@ -319,8 +319,7 @@ def _aligned(avatar: HandAvatar, frame: Frame) -> Frame:
     """Tracked poses of test frames are drawn to their masks, as ``evaluate`` does."""
     if frame.confidence == 1:
         return frame
-    pose = aligned_pose(avatar.coarse_personal, frame.pose, frame.camera, frame.alpha)
-    return replace(frame, pose=pose)
+    return replace(frame, pose=held_out_pose(avatar, frame))
 
 
 @torch.no_grad()
@@ -507,6 +506,12 @@ def judged(
     return scores.by_name, whole
 
 
+@cache
+def _distance() -> PerceptualLoss:
+    """Its weights, where there are any, are read once for all rows."""
+    return perceptual_loss("auto")
+
+
 def _column(shading: Shading, views: list[View]) -> Float[Tensor, "height width 3"]:
     parts = []
     for view in views:
@@ -534,7 +539,7 @@ class FrameScores:
 
     def __init__(self) -> None:
         """None yet."""
-        self._distance = perceptual_loss("auto")
+        self._distance = _distance()
         names = ("psnr", "ssim", "flip", self._distance.name, "psnr_paper")
         self.by_name: dict[str, list[float]] = {name: [] for name in names}
 
@@ -556,8 +561,7 @@ class FrameScores:
 
 
 def _truth(capture: Capture, kind: str, name: str) -> Tensor:
-    with Image.open(capture.folder / "truth" / kind / f"{name}.png") as image:
-        return torch.from_numpy(np.asarray(image).astype(np.float32) / 255)
+    return float_image(capture.folder / "truth" / kind / f"{name}.png")
 
 
 def ablate(

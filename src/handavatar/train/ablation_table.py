@@ -80,6 +80,11 @@ def table_of(measured: Sequence[dict[str, Any]], options: AblationTableOptions) 
     """One line per row; differences are paired by frame, means over seeds."""
     hidden = torch.cat([torch.tensor(found["hidden"]) for found in measured])
     is_hidden = hidden > hidden.median()
+    parts = {
+        "all": torch.ones_like(is_hidden),
+        "occluded half": is_hidden,
+        "open half": ~is_hidden,
+    }
     rows: dict[str, dict[str, Cell]] = {}
     for name, row in ROWS.items():
         of_frame = {key: _per_frame(measured, name, key) for key in _frame_keys(measured[0])}
@@ -88,14 +93,11 @@ def table_of(measured: Sequence[dict[str, Any]], options: AblationTableOptions) 
             line[key] = round(float(values.mean()), 2 if key.startswith("psnr") else 4)
         for key in ("albedo", "shading r", "view spread %"):
             line[key] = _mean_whole(measured, name, key)
-        differences = {"all": None, "occluded half": None, "open half": None}
-        for which in differences:
-            text = None
-            if row.against:
-                gain = of_frame["psnr"] - _per_frame(measured, row.against, "psnr")
-                chosen = {"all": is_hidden | True, "occluded half": is_hidden}
-                text = _interval(gain[chosen.get(which, ~is_hidden)])
-            line[f"gain, {which}"] = text
+        gain = torch.empty(0)
+        if row.against:
+            gain = of_frame["psnr"] - _per_frame(measured, row.against, "psnr")
+        for which, chosen in parts.items():
+            line[f"gain, {which}"] = _interval(gain[chosen]) if row.against else None
         line["against"] = row.against or None
         rows[name] = line
     notes = (
@@ -134,7 +136,4 @@ def _mean_whole(measured: Sequence[dict[str, Any]], name: str, key: str) -> floa
 
 
 def _interval(samples: torch.Tensor) -> str | None:
-    if len(samples) < 2:
-        return None
-    found = mean_interval(samples)
-    return f"{found.mean:+.2f} [{found.low:+.2f}, {found.high:+.2f}]"
+    return mean_interval(samples).of_difference() if len(samples) > 1 else None

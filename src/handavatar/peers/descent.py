@@ -1,0 +1,36 @@
+"""How each of the peers is fitted."""
+
+import math
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+_DECAY = 0.05
+"""The learning rate falls by this factor until the end, exponentially."""
+
+
+def descend(module: nn.Module, loss_of_step: Callable[[], Tensor], steps: int, rate: float) -> None:
+    """Adam on all parameters of a module.
+
+    Args:
+        module: what is fitted.
+        loss_of_step: the loss of the next step, on pixels of its own choice.
+        steps: how many.
+        rate: learning rate at the start.
+
+    Raises:
+        FloatingPointError: if a loss is not finite.
+    """
+    optimizer = torch.optim.Adam(module.parameters(), lr=rate)
+    falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, _DECAY ** (1 / max(steps, 1)))
+    for step in range(steps):
+        loss = loss_of_step()
+        if not math.isfinite(float(loss.detach())):
+            raise FloatingPointError(
+                f"{type(module).__name__}: the loss of step {step + 1} is not finite"
+            )
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        falling.step()
