@@ -36,7 +36,9 @@ def test_sources_come_before_what_is_made_from_them() -> None:
         BenchmarkOptions(only=("purple-key",)).names()
 
 
-def test_what_is_there_is_not_made_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def tiny_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``mini`` takes seconds."""
     pytest.importorskip("mitsuba")
     tiny = replace(
         benchmark._SIZES["mini"],
@@ -49,6 +51,24 @@ def test_what_is_there_is_not_made_again(tmp_path: Path, monkeypatch: pytest.Mon
         variant="scalar_rgb",
     )
     monkeypatch.setitem(benchmark._SIZES, "mini", tiny)
+
+
+def _contents(folder: Path) -> dict[str, bytes]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def test_the_same_bits_every_time(tmp_path: Path, tiny_size: None) -> None:
+    options = BenchmarkOptions(only=("dark-key-pose5",))
+    made = [make_benchmark(tmp_path / place, options) for place in ("first", "second")]
+    for first, second in zip(*made, strict=True):
+        before, after = _contents(first), _contents(second)
+        assert len(before) > 10 and before.keys() == after.keys()
+        for name, content in before.items():
+            assert content == after[name], f"{first.name}/{name}"
+
+
+def test_what_is_there_is_not_made_again(tmp_path: Path, tiny_size: None) -> None:
     seen: list[str] = []
     options = BenchmarkOptions(only=("light-colored-direct", "light-key-pose5"))
     folders = make_benchmark(tmp_path, options, lambda done, name: seen.append(name))

@@ -102,7 +102,12 @@ def degrade_capture(folder: Path, options: DegradeOptions, overwrite: bool = Fal
             torch.stack([frame.pose.translation for frame in frames]),
         )
         write_motion(writer.file("truth/poses.json"), motion)
-        facts = {**asdict(options), "source": str(options.source)}
+        # Its name and not where it lies: the same bits wherever they are made.
+        facts = {
+            **asdict(options),
+            "source": source.folder.resolve().name,
+            "source_sha256": source.sha256,
+        }
         writer.file("truth/degraded.json").write_text(json.dumps(facts, indent=1), "utf-8")
     return read_capture(folder)
 
