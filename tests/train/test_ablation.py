@@ -1,6 +1,7 @@
 """The ablation: parts in their place, the very same samples, and a table that is paired."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -156,5 +157,28 @@ def test_the_table_is_kept_and_paired(
     assert table.rows["+ personal shape"]["shading r"] is None
     monkeypatch.setattr(ablation, "fitted_geometry", None)
     assert ablation_table(options) == table
-    with pytest.raises(CaptureError, match="knows no albedo"):
+    with pytest.raises(CaptureError, match="transforms.json"):
         ablation_table(replace(options, captures=(tmp_path,)))
+
+
+def test_some_rows_of_a_capture_without_truth_and_then_more(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(METHODS, "quick", SMALL)
+    blind = tmp_path / "blind"
+    shutil.copytree(made, blind, ignore=shutil.ignore_patterns("truth"))
+    options = AblationTableOptions((blind,), tmp_path / "kept", ("traced light",), (0,), steps=2)
+    first = ablation_table(replace(options, rows=("(paper)",)))
+    assert list(first.rows) == ["+ directed occupancy (paper)"]
+    row = first.rows["+ directed occupancy (paper)"]
+    assert row["albedo"] is None and row["shading r"] is None and row["gain, all"] is None
+    assert row["against"] is None and float(str(row["psnr"])) > 5
+    both = replace(options, rows=("(paper)", "traced light"))
+    done: list[int] = []
+    table = ablation_table(both, done.append)
+    assert len(done) == both.total_steps == 3
+    assert table.rows["+ directed occupancy (paper)"] == row
+    assert table.rows["traced light"]["gain, all"] is not None
+    assert ablation_table(replace(options, rows=("(paper)",))) == first
+    with pytest.raises(ValueError, match="--rows sunlight: no row"):
+        ablation_table(replace(options, rows=("sunlight",)))

@@ -8,7 +8,7 @@ weights and pixels, and differ in nothing but the part that their name says.
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -487,8 +487,9 @@ def view_spread(shading: Shading, turned: list[list[Place]]) -> float:
 def judged(
     shading: Shading, geometry: FittedGeometry, capture: Capture
 ) -> tuple[dict[str, list[float]], dict[str, float]]:
-    """Figures of every test frame, and figures of the whole."""
+    """Figures of every test frame, and figures of the whole; those of the split need the truth."""
     scores = FrameScores()
+    is_split_known = knows_split(capture)
     albedos, lights, true_albedos, shadings, masks = [], [], [], [], []
     for view in geometry.views:
         picture, frame = shaded_view(shading, view), view.frame
@@ -496,14 +497,23 @@ def judged(
         alpha = picture["alpha"].clamp_min(1e-6)
         albedos.append(picture["albedo"] / alpha[..., None])
         lights.append(picture["light"] / alpha)
-        true_albedos.append(_truth(capture, "albedo", frame.name))
-        shadings.append(_truth(capture, "shading", frame.name))
         masks.append(frame.mask & pair.rendered_mask)
-    whole = {"albedo": albedo_psnr(albedos, true_albedos, masks)}
+        if is_split_known:
+            true_albedos.append(_truth(capture, "albedo", frame.name))
+            shadings.append(_truth(capture, "shading", frame.name))
+    whole = {}
+    if is_split_known:
+        whole["albedo"] = albedo_psnr(albedos, true_albedos, masks)
     if isinstance(shading, SplitShading):
-        whole["shading r"] = shading_correlation(lights, shadings, masks)
+        if is_split_known:
+            whole["shading r"] = shading_correlation(lights, shadings, masks)
         whole["view spread %"] = view_spread(shading, geometry.turned)
     return scores.by_name, whole
+
+
+def knows_split(capture: Capture) -> bool:
+    """Whether the true albedo and light of its frames are there."""
+    return (capture.folder / "truth" / "albedo").is_dir()
 
 
 @cache
@@ -524,8 +534,11 @@ def _column(shading: Shading, views: list[View]) -> Float[Tensor, "height width 
 def _true_column(capture: Capture, frames: list[Frame]) -> Float[Tensor, "height width 3"]:
     parts = []
     for frame in frames:
-        shading = _truth(capture, "shading", frame.name)[..., None].expand(-1, -1, 3)
-        parts += [frame.image.float() / 255 * frame.alpha[..., None], shading]
+        color = frame.image.float() / 255 * frame.alpha[..., None]
+        shading = torch.zeros_like(color)
+        if knows_split(capture):
+            shading = _truth(capture, "shading", frame.name)[..., None].expand(-1, -1, 3)
+        parts += [color, shading]
     return torch.cat(parts)
 
 
@@ -566,15 +579,17 @@ def _truth(capture: Capture, kind: str, name: str) -> Tensor:
 
 def ablate(
     folder: Path,
+    names: Sequence[str],
     seeds: tuple[int, ...],
     steps: int,
     finished: Callable[[], None] = lambda: None,
     pictures: Path | None = None,
 ) -> dict[str, Any]:
-    """All rows on one capture, as JSON takes it: ``rows`` by name and seed, ``hidden`` by frame.
+    """Some rows on one capture, as JSON takes it: ``rows`` by name and seed, ``hidden`` by frame.
 
     Args:
-        folder: of a made capture.
+        folder: of a capture.
+        names: of the rows.
         seeds: of the shadings; the geometry is fitted once.
         steps: of each shading.
         finished: called after every row and seed.
@@ -587,7 +602,8 @@ def ablate(
     begin = time.perf_counter()
     hidden: list[float] = []
     columns: list[Float[Tensor, "height width 3"]] = []
-    for name, row in ROWS.items():
+    for name in names:
+        row = ROWS[name]
         # Where poses are exact there is nothing to correct.
         shape = row.shape
         if shape == "corrected" and not capture.is_tracked:

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from handavatar.capture.checks import CaptureError, load_json
+from handavatar.capture.checks import load_json
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.train.ablation import ROWS, ablate
@@ -20,22 +20,40 @@ class AblationTableOptions:
     """What is compared, and where the figures of every frame are kept.
 
     Attributes:
-        captures: folders of made captures (``handavatar capture benchmark``), comma-separated.
+        captures: folders of captures, comma-separated: made ones (``handavatar capture
+            benchmark``), or any, whose split into albedo and light then is not judged.
         kept: folder; what a capture's rows reached is kept there as ``CAPTURE.json`` and is not
-            measured again with the same steps and seeds; ``CAPTURE.png`` shows three test frames.
+            measured again with the same steps and seeds; ``CAPTURE.png`` shows three test frames
+            of the rows that were measured last.
+        rows: words that the names of the rows to measure contain, comma-separated, as ``(paper)``;
+            by default all rows.
         seeds: of the shadings; geometry is fitted once per capture.
         steps: of each shading.
     """
 
     captures: tuple[Path, ...]
     kept: Path = Path("ablation")
+    rows: tuple[str, ...] = ()
     seeds: tuple[int, ...] = (0, 1, 2)
     steps: int = 310
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Of the rows.
+
+        Raises:
+            ValueError: for a word that no name contains.
+        """
+        for word in self.rows:
+            if not any(word in name for name in ROWS):
+                raise ValueError(f"--rows {word}: no row is called so; there are {'; '.join(ROWS)}")
+        words = self.rows or ("",)
+        return tuple(name for name in ROWS if any(word in name for word in words))
+
+    @property
     def total_steps(self) -> int:
         """Rows and seeds of all captures."""
-        return len(ROWS) * len(self.seeds) * len(self.captures)
+        return len(self.names) * len(self.seeds) * len(self.captures)
 
 
 def ablation_table(
@@ -48,31 +66,30 @@ def ablation_table(
         report: told the number of rows and seeds done.
 
     Raises:
-        CaptureError: if a capture is damaged or knows no truth.
+        CaptureError: if a capture is damaged.
+        ValueError: if there is no row of a name.
 
     Source: paper Sec. 4.3, table of ablations; supplement, disentanglement.
     """
     finished = step_counter(report)
-    for folder in options.captures:
-        if not (folder / "truth" / "albedo").is_dir():
-            raise CaptureError(
-                f"{folder}: knows no albedo", "name captures of `handavatar capture benchmark`"
-            )
     measured = []
     for folder in options.captures:
         path = options.kept / f"{folder.name}.json"
-        found = load_json(path) if path.is_file() else {}
-        if found.get("steps") == options.steps and found.get("seeds") == list(options.seeds):
-            for _ in range(len(ROWS) * len(options.seeds)):
-                finished()
-        else:
+        kept = load_json(path) if path.is_file() else {}
+        if (kept.get("steps"), kept.get("seeds")) != (options.steps, list(options.seeds)):
+            kept = {"rows": {}}
+        missing = [name for name in options.names if name not in kept["rows"]]
+        for _ in range((len(options.names) - len(missing)) * len(options.seeds)):
+            finished()
+        if missing:
             picture = options.kept / f"{folder.name}.png"
-            found = ablate(folder, options.seeds, options.steps, finished, picture)
+            found = ablate(folder, missing, options.seeds, options.steps, finished, picture)
+            found["rows"] = {**kept["rows"], **found["rows"]}
             found["seeds"] = list(options.seeds)
-            found = json.loads(json.dumps(found))
+            kept = json.loads(json.dumps(found))
             options.kept.mkdir(parents=True, exist_ok=True)
-            write_json(path, found)
-        measured.append(found)
+            write_json(path, kept)
+        measured.append(kept)
     return table_of(measured, options)
 
 
@@ -86,7 +103,9 @@ def table_of(measured: Sequence[dict[str, Any]], options: AblationTableOptions) 
         "open half": ~is_hidden,
     }
     rows: dict[str, dict[str, Cell]] = {}
-    for name, row in ROWS.items():
+    for name in options.names:
+        row = ROWS[name]
+        is_compared = row.against in options.names
         of_frame = {key: _per_frame(measured, name, key) for key in _frame_keys(measured[0])}
         line: dict[str, Cell] = {}
         for key, values in of_frame.items():
@@ -94,16 +113,17 @@ def table_of(measured: Sequence[dict[str, Any]], options: AblationTableOptions) 
         for key in ("albedo", "shading r", "view spread %"):
             line[key] = _mean_whole(measured, name, key)
         gain = torch.empty(0)
-        if row.against:
+        if is_compared:
             gain = of_frame["psnr"] - _per_frame(measured, row.against, "psnr")
         for which, chosen in parts.items():
-            line[f"gain, {which}"] = _interval(gain[chosen]) if row.against else None
-        line["against"] = row.against or None
+            line[f"gain, {which}"] = _interval(gain[chosen]) if is_compared else None
+        line["against"] = row.against if is_compared else None
         rows[name] = line
     notes = (
         f"Captures: {', '.join(found['capture'] for found in measured)}; {len(hidden)} test frames "
         f"of poses and cameras never seen, seeds {list(options.seeds)} of the shadings, "
-        f"{options.steps} steps each; geometry is fitted once per capture and kind of shape.",
+        f"{options.steps} steps each; geometry is fitted once per capture and kind of shape. Albedo "
+        "and shading are judged where all captures know the truth.",
         "Gain: masked PSNR over the row that it is compared with, decibels, mean over frames of "
         "the mean over seeds [95 % over frames]; the occluded half are the frames in which the "
         "hand hides more of its own sky than in the median frame.",
