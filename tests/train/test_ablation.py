@@ -157,7 +157,7 @@ def test_the_table_is_kept_and_paired(
     assert table.rows["+ personal shape"]["shading r"] is None
     monkeypatch.setattr(ablation, "fitted_geometry", None)
     assert ablation_table(options) == table
-    with pytest.raises(CaptureError, match="transforms.json"):
+    with pytest.raises(CaptureError, match="transforms"):
         ablation_table(replace(options, captures=(tmp_path,)))
 
 

@@ -122,8 +122,8 @@ def table_of(measured: Sequence[dict[str, Any]], options: AblationTableOptions) 
     notes = (
         f"Captures: {', '.join(found['capture'] for found in measured)}; {len(hidden)} test frames "
         f"of poses and cameras never seen, seeds {list(options.seeds)} of the shadings, "
-        f"{options.steps} steps each; geometry is fitted once per capture and kind of shape. Albedo "
-        "and shading are judged where all captures know the truth.",
+        f"{options.steps} steps each; geometry is fitted once per capture and kind of shape. "
+        "Albedo and shading are judged where all captures know the truth.",
         "Gain: masked PSNR over the row that it is compared with, decibels, mean over frames of "
         "the mean over seeds [95 % over frames]; the occluded half are the frames in which the "
         "hand hides more of its own sky than in the median frame.",
