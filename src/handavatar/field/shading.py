@@ -73,6 +73,7 @@ class PaperCues:
     width = 85
     hidden = (256,) * 4
     num_directions = 0
+    pose_dropout = 0.0
 
     def __call__(self, cues: Cues) -> Float[Tensor, "queries 85"]:
         """The network's input."""
@@ -86,6 +87,7 @@ class PlainCues:
     width = 69
     hidden = (256,) * 4
     num_directions = 0
+    pose_dropout = 0.0
 
     def __call__(self, cues: Cues) -> Float[Tensor, "queries 69"]:
         """The network's input."""
@@ -103,6 +105,7 @@ class OrientedCues:
     width = 88
     hidden = (256,) * 4
     num_directions = 0
+    pose_dropout = 0.0
 
     def __call__(self, cues: Cues) -> Float[Tensor, "queries 88"]:
         """The network's input."""
@@ -110,25 +113,30 @@ class OrientedCues:
 
 
 class TracedCues:
-    """What a light in each of many directions would bring, the normal, and the place.
+    """What a light in each of many directions would bring, the normal, the place, and the pose.
 
     Departs: the paper looks for what casts shadows along the view ray, so that shadows move with
         the camera, and must learn from the pose what the light does. Here the posed mesh itself
         says which part of the sky a place sees (:func:`handavatar.render.skylight.sky_light`), in
         the world's axes; the network learns how bright each part is, and what comes second hand.
+        The pose is there for what follows it and is not traced: skin that stretches and folds, a
+        pose that is a little off, the body behind the hand. While training, some frames come
+        without theirs (``pose_dropout``, as a share), so that light is not read off the pose
+        where tracing can tell.
     """
 
     name = "traced"
-    hidden = (128,) * 3
+    hidden = (256,) * 4
+    pose_dropout = 0.1
 
     def __init__(self, num_directions: int = 112) -> None:
         """With so many directions of light; which ones, the field knows."""
         self.num_directions = num_directions
-        self.width = num_directions + 24
+        self.width = num_directions + 72
 
     def __call__(self, cues: Cues) -> Float[Tensor, "queries width"]:
         """The network's input."""
-        return torch.cat([cues.light, cues.normals, cues.places], dim=-1)
+        return torch.cat([cues.light, cues.normals, cues.places, cues.pose], dim=-1)
 
 
 CueSet = PaperCues | PlainCues | OrientedCues | TracedCues

@@ -51,7 +51,12 @@ from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_throug
 from handavatar.geometry.meshes import SurfacePoints
 from handavatar.hand.rig import ShapedHand
 from handavatar.render.volume import composite_sparse
-from handavatar.train.appearance import SeenSamples, chosen_samples, find_seen_samples
+from handavatar.train.appearance import (
+    SeenSamples,
+    chosen_samples,
+    find_seen_samples,
+    with_hidden_poses,
+)
 from handavatar.train.loop import (
     METHODS,
     Method,
@@ -119,6 +124,7 @@ class SplitShading(nn.Module):
         self.albedo = AlbedoField(len(anchors))
         self.illumination = IlluminationField(anchors, cues)
         self.change = change
+        self.pose_dropout = cues.pose_dropout
         _start(self.albedo.mlp, color / START_LIGHT)
         _start(self.illumination.mlp, torch.tensor([START_LIGHT]))
 
@@ -137,6 +143,8 @@ class SplitShading(nn.Module):
 
 class EntangledShading(nn.Module):
     """One colour from code, place and pose: what the paper splits."""
+
+    pose_dropout = 0.0
 
     def __init__(self, anchors: Float[Tensor, "anchors 3"], color: Float[Tensor, "3"]) -> None:
         """Starts as one colour."""
@@ -429,7 +437,8 @@ def trained_shading(
                 group["lr"] = rate * factor
         pixels = torch.randint(len(seen.colors), (method.warm_pixels,), generator=generator)
         sample, ray = chosen_samples(seen, pixels)
-        values = shading(_rows_of(seen, sample))[:, :3]
+        shown = with_hidden_poses(seen, shading.pose_dropout, generator)
+        values = shading(_rows_of(shown, sample))[:, :3]
         color = composite_sparse(seen.weights[sample], ray, values, len(pixels))
         loss = color_loss(color / seen.alpha[pixels][:, None], seen.colors[pixels])
         if not math.isfinite(float(loss.detach())):

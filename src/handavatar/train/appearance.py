@@ -5,7 +5,7 @@ anchors and what lies before them stay the same. They are found once; then a ste
 small networks and can look at pixels of all frames at once.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -104,6 +104,14 @@ def chosen_samples(
     ray = torch.arange(len(pixels), device=pixels.device).repeat_interleave(count)
     first = count.cumsum(0) - count
     return begin[ray] + torch.arange(len(ray), device=pixels.device) - first[ray], ray
+
+
+def with_hidden_poses(seen: SeenSamples, share: float, generator: torch.Generator) -> SeenSamples:
+    """The same samples; a share of the frames, drawn anew, shows zeros in place of its pose."""
+    if not share:
+        return seen
+    is_known = torch.rand(len(seen.rotations), generator=generator) >= share
+    return replace(seen, rotations=seen.rotations * is_known.to(seen.rotations)[:, None, None])
 
 
 def appearance_loss(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar, RenderSettings, chosen_device
@@ -21,7 +21,12 @@ from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.rigs import find_rig
 from handavatar.render.silhouette import soft_mask
-from handavatar.train.appearance import SeenSamples, appearance_loss, find_seen_samples
+from handavatar.train.appearance import (
+    SeenSamples,
+    appearance_loss,
+    find_seen_samples,
+    with_hidden_poses,
+)
 from handavatar.train.border import border_pixels, fit_border
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.labelled_poses import sample_points
@@ -442,11 +447,14 @@ def corrected_frames(training: Training, frames: list[Frame]) -> list[Frame]:
     ]
 
 
-def _some_pixels(
-    seen: SeenSamples, method: Method, generator: torch.Generator
-) -> Int[Tensor, "pixels"]:
+def _recalled(
+    avatar: HandAvatar, seen: SeenSamples, method: Method, generator: torch.Generator
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""]]:
+    """Colour loss and squared error of pixels drawn from all frames."""
     pixels = torch.randint(len(seen.colors), (method.warm_pixels,), generator=generator)
-    return pixels.to(seen.colors.device)
+    pixels = pixels.to(seen.colors.device)
+    shown = with_hidden_poses(seen, avatar.illumination.chosen.pose_dropout, generator)
+    return appearance_loss(avatar, shown, pixels)
 
 
 def warm_step(
@@ -455,7 +463,7 @@ def warm_step(
     """One optimiser step of the appearance alone, on ``seen``."""
     generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
     _clear_gradients(training)
-    color, squared = appearance_loss(training.avatar, seen, _some_pixels(seen, method, generator))
+    color, squared = _recalled(training.avatar, seen, method, generator)
     color.backward()
     for optimizer in training.optimizers.values():
         optimizer.step()
@@ -498,7 +506,7 @@ def train_step(
         for name, value in {**losses, "loss": total * method.frames, "squared": squared}.items():
             sums[name] = sums.get(name, 0.0) + float(value.detach()) / method.frames
     if seen is not None:
-        recall, _ = appearance_loss(training.avatar, seen, _some_pixels(seen, method, generator))
+        recall, _ = _recalled(training.avatar, seen, method, generator)
         recall.backward()
         sums["recall"] = float(recall.detach())
     for optimizer in training.optimizers.values():
