@@ -23,8 +23,11 @@ from handavatar.geometry.rotations import invert_rigid, matrix_from_axis_angle
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
 from handavatar.hand.rig import ShapedHand
 
-NUM_LIGHT_POSES = 12
-"""Poses, and as many turns of the wrist, whose light is averaged."""
+NUM_LIGHT_POSES = 20
+"""Poses, and as many turns of the wrist, whose light is averaged: an anchor's mean over them is
+within 0.07 of full light (rms) of that over 64."""
+_SETTINGS = RenderSettings(num_samples=32)
+"""Half the samples of a picture change an anchor's mean by 0.02."""
 _LEAST_COSINE = 0.3
 _LEAST_ALPHA = 0.9
 _SAME_PLACE = 5e-3
@@ -116,6 +119,7 @@ def baked_textures(
     size: int,
     has_light_baked: bool = False,
     has_occlusion: bool = True,
+    light_poses: int = NUM_LIGHT_POSES,
 ) -> Textures:
     """Albedo, and the mean light in a picture of its own or in the colours.
 
@@ -126,13 +130,14 @@ def baked_textures(
         size: texels along a side of the albedo; the occlusion has half.
         has_light_baked: multiply the colours by the mean light, as pictures do on average.
         has_occlusion: otherwise make the occlusion.
+        light_poses: that the mean light is taken over.
     """
     texels = texels_of(hand.rig, size)
     near = anchors_near(avatar, hand, points_of_texels(hand, texels))
     colors = albedo_at(avatar, near, edit)
     if not has_light_baked and not has_occlusion:
         return Textures(_png(texels.filled(colors)), b"", 0.0)
-    light = mean_light(avatar, hand, edit)
+    light = mean_light(avatar, hand, edit, light_poses)
     if has_light_baked:
         colors = colors * near.interpolated(light.anchors[:, None])
         return Textures(_png(texels.filled(colors)), b"", light.level)
@@ -143,14 +148,18 @@ def baked_textures(
 
 
 def colors_at_vertices(
-    avatar: HandAvatar, hand: ShapedHand, edit: Edit, has_light_baked: bool = False
+    avatar: HandAvatar,
+    hand: ShapedHand,
+    edit: Edit,
+    has_light_baked: bool = False,
+    light_poses: int = NUM_LIGHT_POSES,
 ) -> Float[Tensor, "vertices 3"]:
     """Colours of a hand's vertices; see :func:`baked_textures`."""
     near = anchors_near(avatar, hand, hand.rest_vertices)
     colors = albedo_at(avatar, near, edit)
     if not has_light_baked:
         return colors
-    return colors * near.interpolated(mean_light(avatar, hand, edit).anchors[:, None])
+    return colors * near.interpolated(mean_light(avatar, hand, edit, light_poses).anchors[:, None])
 
 
 @torch.no_grad()
@@ -188,7 +197,7 @@ def mean_light(
         cosine = -(state.anchor_normals * away).sum(-1) / distance
         facing = (cosine > _LEAST_COSINE).nonzero()[:, 0]
         rays = Rays(eye.expand(len(facing), 3), (away / distance[:, None])[facing])
-        seen = avatar.render_rays(state, rays, RenderSettings(), edit=edit)
+        seen = avatar.render_rays(state, rays, _SETTINGS, edit=edit)
         is_there = seen.alpha > _LEAST_ALPHA
         depth = seen.depth / seen.alpha.clamp_min(_LEAST_ALPHA)
         is_there &= (depth - distance[facing]).abs() < _SAME_PLACE

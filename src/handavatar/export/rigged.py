@@ -10,7 +10,7 @@ from torch import Tensor
 from handavatar.avatar import HandAvatar
 from handavatar.capture.motion import Motion
 from handavatar.edit import Edit
-from handavatar.export.baking import baked_textures
+from handavatar.export.baking import NUM_LIGHT_POSES, baked_textures
 from handavatar.export.chart import charted
 from handavatar.export.gltf import Clip, SkinnedMesh
 from handavatar.export.skeletons import BoneNames, Skeleton, skeleton_of
@@ -32,6 +32,7 @@ def skinned_mesh(
     texture_size: int = 1024,
     motion: Motion | None = None,
     is_unlit: bool = False,
+    light_poses: int = NUM_LIGHT_POSES,
 ) -> SkinnedMesh:
     """The avatar as engines take it: one rest shape, four bones a vertex, textures.
 
@@ -44,13 +45,14 @@ def skinned_mesh(
             and the axes are those of the avatar's typical view, so that who looks along -z sees
             what ``handavatar render`` shows.
         is_unlit: bake the mean light into the colours, for materials that no light changes.
+        light_poses: that the mean light is taken over.
     """
     edit = edit or Edit()
     side = str(avatar.info.get("side", "right"))
     hand = average_hand(avatar)
     rig = charted(avatar.base_rig, hand.rig, avatar.rounds)
     hand = ShapedHand(rig, hand.rest_vertices, hand.rest_joints)
-    textures = baked_textures(avatar, hand, edit, texture_size, is_unlit)
+    textures = baked_textures(avatar, hand, edit, texture_size, is_unlit, light_poses=light_poses)
     skeleton = skeleton_of(hand, bones, side)
     seamed = split_at_seams(rig)
     skin = SparseSkin.of(rig.skin_weights, avatar.base_rig, avatar.rounds)
