@@ -2,12 +2,13 @@
 
 import io
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from mano_files import write_mano
 from PIL import Image
-from test_chart import mano  # noqa: F401
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.motion import middle_of_hand
@@ -24,6 +25,7 @@ from handavatar.field.anchors import nearest_anchors
 from handavatar.geometry.cameras import Camera, look_at, project
 from handavatar.geometry.colors import linear_from_srgb
 from handavatar.geometry.meshes import SurfacePoints
+from handavatar.hand.mano import read_mano
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
 from handavatar.hand.rig import Rig, ShapedHand
@@ -159,7 +161,8 @@ def test_the_occlusion_is_a_grey_picture_of_half_the_size(
 
 
 @torch.no_grad()
-def test_an_atlas_carries_the_same_colours_as_the_vertices(mano: Rig) -> None:  # noqa: F811
+def test_an_atlas_carries_the_same_colours_as_the_vertices(tmp_path: Path) -> None:
+    mano = read_mano(write_mano(tmp_path / "MANO_RIGHT.pkl")).rig
     avatar = HandAvatar(mano, torch.zeros(10), rounds=0, num_anchors=128)
     avatar.albedo.codes.mul_(10)
     hand = average_hand(avatar, 3)

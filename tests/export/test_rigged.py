@@ -4,11 +4,13 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from independent import Reading, rigid_fit
+from mano_files import write_mano
 from scipy.spatial.transform import Rotation
 
 from handavatar.avatar import HandAvatar
@@ -16,8 +18,9 @@ from handavatar.capture.motion import Motion
 from handavatar.export.gltf import SkinnedMesh, glb_bytes
 from handavatar.export.rigged import mirrored, skinned_mesh
 from handavatar.export.skeletons import BoneNames
-from handavatar.export.surface import average_hand
+from handavatar.export.surface import average_hand, rest_shape_error
 from handavatar.geometry.cameras import look_at
+from handavatar.hand.mano import read_mano
 from handavatar.hand.pose import FINGER_BONES, HandPose
 from handavatar.hand.pose_sampling import sample_poses
 
@@ -225,6 +228,8 @@ def test_one_rest_shape_is_nearer_to_all_poses_than_the_flat_hands(
             errors["average"] += float((hand.posed(pose).vertices - own).square().sum())
             errors["flat"] += float((flat.posed(pose).vertices - own).square().sum())
     assert errors["average"] < errors["flat"]
+    mean, most = rest_shape_error(small_avatar, hand)
+    assert 0 < mean < most < 0.01
     assert int((hand.rig.skin_weights > 0).sum(-1).max()) <= 4
     assert math.isclose(float(hand.rig.skin_weights.sum(-1).max()), 1, rel_tol=1e-6)
 
@@ -236,6 +241,20 @@ def test_a_rest_shape_that_knows_no_pose_is_kept(small_avatar: HandAvatar) -> No
     expected = avatar.rig.shaped(torch.ones(10))
     torch.testing.assert_close(hand.rest_vertices, expected.rest_vertices, atol=1e-7, rtol=0)
     torch.testing.assert_close(hand.rest_joints, expected.rest_joints, atol=1e-7, rtol=0)
+    # But for what the bones beyond four did, and single precision.
+    whole = replace(hand, rig=avatar.rig)
+    assert rest_shape_error(avatar, whole, count=3)[1] < 1e-6
+
+
+def test_pose_blend_shapes_are_in_the_average_too(tmp_path: Path) -> None:
+    rig = read_mano(write_mano(tmp_path / "MANO_RIGHT.pkl")).rig
+    avatar = HandAvatar(rig, torch.zeros(10), rounds=0, num_anchors=16)
+    torch.nn.init.zeros_(avatar.shape.mlp.output.weight)
+    hand = average_hand(avatar, count=3)
+    rotations = sample_poses(rig, 3, torch.Generator().manual_seed(0))
+    expected = rig.template_vertices + rig.pose_offsets(rotations).mean(0)
+    torch.testing.assert_close(hand.rest_vertices, expected, atol=1e-6, rtol=0)
+    assert hand.rig.pose_directions.numel() == 0
 
 
 def test_more_vertices_than_two_bytes_count_are_written(

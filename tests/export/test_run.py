@@ -11,7 +11,7 @@ import trimesh
 from independent import Reading
 
 from handavatar import cli
-from handavatar.avatar import HandAvatar
+from handavatar.avatar import CheckpointError, HandAvatar
 from handavatar.capture.motion import gesture
 from handavatar.export import rigged, run
 from handavatar.export.run import ExportOptions, export_avatar
@@ -164,6 +164,16 @@ def test_bad_data_is_named_and_nothing_is_written(
     assert cli.main(["export", str(saved), words[0], "--out", str(out), *words[1:]]) == 3
     assert message in capsys.readouterr().err
     assert not os.listdir(tmp_path)
+
+
+def test_an_avatar_that_is_not_finite_is_refused(saved: Path, tmp_path: Path) -> None:
+    avatar = HandAvatar.load(saved)
+    with torch.no_grad():
+        avatar.albedo.codes[3, 4] = torch.nan
+    avatar.save(tmp_path / "broken.safetensors")
+    with pytest.raises(CheckpointError, match="NaN"):
+        export_avatar(ExportOptions(tmp_path / "broken.safetensors", "ply", tmp_path / "hand.ply"))
+    assert os.listdir(tmp_path) == ["broken.safetensors"]
 
 
 def test_what_lies_there_is_replaced_only_if_told_and_whole(

@@ -14,7 +14,7 @@ from handavatar.export.baking import NUM_LIGHT_POSES, baked_textures
 from handavatar.export.chart import charted
 from handavatar.export.gltf import Clip, SkinnedMesh
 from handavatar.export.skeletons import BoneNames, Skeleton, skeleton_of
-from handavatar.export.surface import average_hand, split_at_seams
+from handavatar.export.surface import average_hand, rest_shape_error, split_at_seams
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.geometry.rotations import apply_rigid, invert_rigid, rigid_transform
 from handavatar.hand.pose import bone_transforms
@@ -76,7 +76,7 @@ def skinned_mesh(
         occlusion=textures.occlusion,
         is_unlit=is_unlit,
         clip=clip,
-        facts=_facts(avatar, bones, textures.full_light),
+        facts=_facts(avatar, hand, bones, textures.full_light),
     )
     return mirrored(mesh) if side == "left" else mesh
 
@@ -122,11 +122,15 @@ def _clip(avatar: HandAvatar, hand: ShapedHand, skeleton: Skeleton, motion: Moti
     return Clip("motion", motion.fps, file_from_world @ world_from_joint)
 
 
-def _facts(avatar: HandAvatar, bones: BoneNames, full_light: float) -> dict[str, Any]:
+def _facts(
+    avatar: HandAvatar, hand: ShapedHand, bones: BoneNames, full_light: float
+) -> dict[str, Any]:
     """What the file says of itself."""
     known = ("side", "subject", "method", "licence", "color_space")
     facts = {name: avatar.info[name] for name in known if name in avatar.info}
     facts |= {"bones": bones, "rig": avatar.base_rig.name, "full_light": round(full_light, 4)}
+    mean, most = (round(1000 * error, 3) for error in rest_shape_error(avatar, hand))
+    facts["rest_shape_error_mm"] = {"mean": mean, "p95": most}
     if avatar.base_rig.is_licensed:
         facts["rig_licence"] = "the rig's own: mesh and weights derive from a licensed file"
     return {"handavatar": facts}

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from handavatar import __version__
-from handavatar.avatar import HandAvatar
+from handavatar.avatar import CheckpointError, HandAvatar
 from handavatar.capture.motion import gesture, open_motion
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
@@ -81,6 +81,9 @@ def export_avatar(options: ExportOptions) -> Path:
     look.check()
     _check(options)
     avatar = HandAvatar.load(options.run)
+    weights = [value for value in avatar.state_dict().values() if value.is_floating_point()]
+    if not all(bool(torch.isfinite(value).all()) for value in weights):
+        raise CheckpointError(f"{options.run}: holds NaN or infinity; train the avatar again")
     edit = look.on(avatar)
     if options.format == "glb":
         contents = [_glb(avatar, edit, options)]
