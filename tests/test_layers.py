@@ -28,7 +28,8 @@ MAY_IMPORT = {
         "train": "geometry hand capture field render avatar plain alignment evaluate processes",
         # Prior art, for a table alone.
         "peers": "geometry hand capture field render avatar evaluate train",
-        "export": "geometry hand capture edit avatar",
+        # A texture's chart is rasterised; words of an edit mean what they mean elsewhere.
+        "export": "geometry hand capture field render edit avatar retouch",
         "view": "geometry hand capture edit avatar",
         # What words and pictures mean to an avatar.
         "retouch": "hand capture edit avatar",

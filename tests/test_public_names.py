@@ -53,6 +53,9 @@ AT_LEAST = {
     "hand.skin_refinement": "RefinementOptions SkinRefinement refine_skin",
     "hand.sparse_skin": "SparseSkin SparseSkin.load SparseSkin.save",
     "evaluate.run": "EvaluateOptions evaluate_run",
+    "export.run": "ExportOptions export_avatar",
+    "export.rigged": "skinned_mesh mirrored",
+    "export.gltf": "Clip SkinnedMesh glb_bytes",
     "doctor": "Finding examine",
     "cli": "main",
 }

@@ -21,7 +21,8 @@ from PIL import Image
 from torch import Tensor
 
 from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chosen_device
-from handavatar.capture.motion import MOTIONS, Motion, named_motion, read_motion
+from handavatar.capture.motion import open_motion
+from handavatar.capture.view import start_of
 from handavatar.edit import Edit
 from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.geometry.cameras import Camera, look_at, project
@@ -116,7 +117,8 @@ def render_motion(options: RenderOptions) -> Path:
     kernel = chosen_kernel(options.kernel, device)
     avatar = HandAvatar.load(options.run)
     edit = look.on(avatar)
-    motion = _chosen_motion(avatar, options.motion)
+    start = start_of(avatar.info.get("view"))
+    motion = open_motion(options.motion, avatar.base_rig.to("cpu"), start)
     poses = [motion.pose(step) for step in _spread(len(motion), options.frames)]
     camera = camera_on(avatar, poses, options.size)
     views = [camera] * len(poses)
@@ -345,16 +347,6 @@ class VideoWriter:
         """Finishes the file."""
         self._container.mux(self._stream.encode())
         self._container.close()
-
-
-def _chosen_motion(avatar: HandAvatar, name: str) -> Motion:
-    if name not in MOTIONS:
-        return read_motion(Path(name))
-    view = avatar.info.get("view")
-    start = HandPose.flat()
-    if view is not None:
-        start = HandPose(torch.tensor(view["rotations"]), torch.tensor(view["translation"]))
-    return named_motion(avatar.base_rig.to("cpu"), name, start)
 
 
 def _spread(length: int, count: int | None) -> list[int]:

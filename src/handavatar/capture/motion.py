@@ -283,6 +283,22 @@ def named_motion(
     )
 
 
+def open_motion(reference: str, rig: Rig, start: HandPose) -> Motion:
+    """A motion as a user calls it.
+
+    Args:
+        reference: key of ``MOTIONS``, or the path of a motion file.
+        rig: whose joints move.
+        start: where a motion of ``MOTIONS`` is performed.
+
+    Raises:
+        CaptureError: what is wrong with the file.
+    """
+    if reference in MOTIONS:
+        return named_motion(rig, reference, start)
+    return read_motion(Path(reference))
+
+
 def middle_of_hand(rig: Rig, pose: HandPose) -> Float[Tensor, "3"]:
     """Where the middle of the palm is in the world, metres."""
     joints = rig.shaped().rest_joints

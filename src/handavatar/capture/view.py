@@ -6,6 +6,7 @@ import torch
 
 from handavatar.capture.frames import Frame
 from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.hand.pose import HandPose
 
 
 def view_of(frames: list[Frame]) -> dict[str, Any]:
@@ -22,3 +23,10 @@ def view_of(frames: list[Frame]) -> dict[str, Any]:
         "rotations": frame.pose.rotations.tolist(),
         "translation": frame.pose.translation.tolist(),
     }
+
+
+def start_of(view: dict[str, Any] | None) -> HandPose:
+    """The hand in the typical view of an avatar's capture; flat, at the origin, if unknown."""
+    if view is None:
+        return HandPose.flat()
+    return HandPose(torch.tensor(view["rotations"]), torch.tensor(view["translation"]))

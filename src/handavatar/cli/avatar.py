@@ -1,4 +1,4 @@
-"""``handavatar train``, ``evaluate`` and ``render``: from a capture to pictures of new poses."""
+"""``handavatar train``, ``evaluate``, ``edit``, ``render`` and ``export``: an avatar's life."""
 
 
 def train(words: list[str]) -> int:
@@ -40,4 +40,13 @@ def render(words: list[str]) -> int:
     folder = render_motion(parse(RenderOptions, words, "render", positional=("run",)))
     if is_first_process():
         print(folder)
+    return 0
+
+
+def export(words: list[str]) -> int:
+    """Avatar -> a rigged GLB with textures, or a posed surface as PLY or OBJ."""
+    from handavatar.cli.arguments import parse
+    from handavatar.export.run import ExportOptions, export_avatar
+
+    print(export_avatar(parse(ExportOptions, words, "export", positional=("run", "format"))))
     return 0

@@ -1,0 +1,174 @@
+"""``handavatar export``: an avatar as files that other programs open."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from handavatar import __version__
+from handavatar.avatar import CheckpointError, HandAvatar
+from handavatar.capture.motion import gesture, open_motion
+from handavatar.capture.view import start_of
+from handavatar.edit import Edit
+from handavatar.export.baking import baked_textures, colors_at_vertices
+from handavatar.export.chart import charted
+from handavatar.export.gltf import glb_bytes
+from handavatar.export.polygons import obj_bytes, ply_bytes
+from handavatar.export.rigged import MIRROR, skinned_mesh
+from handavatar.export.skeletons import BoneNames
+from handavatar.export.surface import average_hand
+from handavatar.geometry.meshes import vertex_normals
+from handavatar.hand.pose import HandPose
+from handavatar.hand.rig import ShapedHand
+from handavatar.retouch import Look
+
+MAX_TEXTURE = 8192
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """An avatar as files that other programs open.
+
+    Attributes:
+        run: run folder, or an avatar file.
+        format: ``glb`` has bones, skin weights and textures; ``ply`` (a colour per vertex) and
+            ``obj`` (with .mtl and .png beside it) are the surface in one pose.
+        out: file to write.
+        bones: names of the joints in a GLB, and how they are arranged: ``webxr`` is the flat
+            skeleton of 25 joints that three.js's XRHandMeshModel drives, the others are trees.
+        texture_size: texels along a side of the albedo; the occlusion texture has half.
+        motion: a motion file (JSON) or a built-in motion (gestures, count, grasp, pinch, ripple,
+            turn) that a GLB carries as an animation.
+        pose: a gesture (flat, relaxed, fist, point, ...) that PLY and OBJ show.
+        unlit: colours with the mean light baked in, and no engine's light on them.
+        light_gain: multiplies the illumination.
+        albedo_shift: added to the albedo, R,G,B in [-1, 1].
+        lift_shadow: fingers or bones that cast no shadow, comma-separated.
+        paint: a picture with transparency (PNG) in the rig's texture chart, laid on the skin.
+        overwrite: replace what lies at ``out``.
+    """
+
+    run: Path
+    format: Literal["glb", "ply", "obj"]
+    out: Path
+    bones: BoneNames = "webxr"
+    texture_size: int = 1024
+    motion: str | None = None
+    pose: str = "flat"
+    unlit: bool = False
+    light_gain: float = 1.0
+    albedo_shift: str = "0,0,0"
+    lift_shadow: str = ""
+    paint: Path | None = None
+    overwrite: bool = False
+
+
+def export_avatar(options: ExportOptions) -> Path:
+    """Writes the files, aside first.
+
+    Returns:
+        The file that was asked for.
+
+    Raises:
+        CheckpointError: if the avatar cannot be read.
+        CaptureError: if the motion or the paint cannot be read, or there is no such gesture.
+        ValueError: for options that contradict each other, or a file that is there already.
+    """
+    look = Look(options.light_gain, options.albedo_shift, options.lift_shadow, options.paint)
+    look.check()
+    _check(options)
+    avatar = HandAvatar.load(options.run)
+    weights = [value for value in avatar.state_dict().values() if value.is_floating_point()]
+    if not all(bool(torch.isfinite(value).all()) for value in weights):
+        raise CheckpointError(f"{options.run}: holds NaN or infinity; train the avatar again")
+    edit = look.on(avatar)
+    if options.format == "glb":
+        contents = [_glb(avatar, edit, options)]
+    elif options.format == "ply":
+        contents = [_ply(avatar, edit, options)]
+    else:
+        contents = _obj(avatar, edit, options)
+    _write(dict(zip(_files(options), contents, strict=True)))
+    return options.out
+
+
+def _check(options: ExportOptions) -> None:
+    """Refuses what contradicts itself, before anything is read."""
+    if options.out.suffix.lower() != f".{options.format}":
+        raise ValueError(f"--out {options.out}: expected a name that ends in .{options.format}")
+    if not 16 <= options.texture_size <= MAX_TEXTURE:
+        raise ValueError(
+            f"--texture-size {options.texture_size}: expected 16 to {MAX_TEXTURE} texels"
+        )
+    if options.format == "glb" and options.pose != "flat":
+        raise ValueError("--pose: a GLB is in its rest pose; animate it with --motion")
+    if options.format != "glb" and options.motion is not None:
+        raise ValueError(f"--motion: {options.format.upper()} cannot move; choose glb, or --pose")
+    for path in _files(options):
+        if path.exists() and not (options.overwrite and path.is_file()):
+            raise ValueError(f"--out: {path} exists; name another file, or add --overwrite")
+
+
+def _files(options: ExportOptions) -> list[Path]:
+    beside = (".png", ".mtl") if options.format == "obj" else ()
+    return [*(options.out.with_suffix(suffix) for suffix in beside), options.out]
+
+
+def _glb(avatar: HandAvatar, edit: Edit, options: ExportOptions) -> bytes:
+    motion = None
+    if options.motion is not None:
+        start = start_of(avatar.info.get("view"))
+        motion = open_motion(options.motion, avatar.base_rig, start)
+    size = options.texture_size
+    mesh = skinned_mesh(avatar, edit, options.bones, size, motion, options.unlit)
+    return glb_bytes(mesh, f"handavatar {__version__}")
+
+
+def _surface(avatar: HandAvatar, options: ExportOptions) -> tuple[Tensor, Tensor, Tensor]:
+    """Vertices and normals of the personal hand in the pose, and faces; of the hand's own side."""
+    pose = HandPose(gesture(avatar.base_rig, options.pose), torch.zeros(3))
+    with torch.no_grad():
+        vertices = avatar.personal(pose).posed(pose).vertices
+    faces = avatar.rig.faces
+    normals = vertex_normals(vertices, faces)
+    if avatar.info.get("side") == "left":
+        flip = vertices.new_tensor(MIRROR)
+        return vertices * flip, normals * flip, faces.flip(-1)
+    return vertices, normals, faces
+
+
+def _ply(avatar: HandAvatar, edit: Edit, options: ExportOptions) -> bytes:
+    hand = average_hand(avatar)
+    vertices, normals, faces = _surface(avatar, options)
+    colors = colors_at_vertices(avatar, hand, edit, options.unlit)
+    return ply_bytes(vertices, normals, colors, faces, ("metres, +y up; colours are sRGB",))
+
+
+def _obj(avatar: HandAvatar, edit: Edit, options: ExportOptions) -> list[bytes]:
+    hand = average_hand(avatar)
+    rig = charted(avatar.base_rig, hand.rig, avatar.rounds)
+    hand = ShapedHand(rig, hand.rest_vertices, hand.rest_joints)
+    vertices, normals, faces = _surface(avatar, options)
+    places = rig.uv_faces.flip(-1) if avatar.info.get("side") == "left" else rig.uv_faces
+    texts = obj_bytes(vertices, normals, rig.uv_coordinates, faces, places, options.out.stem)
+    textures = baked_textures(avatar, hand, edit, options.texture_size, options.unlit, False)
+    return [textures.base_color, texts.material, texts.mesh]
+
+
+def _write(files: dict[Path, bytes]) -> None:
+    """All aside first, then renamed: nothing half written is ever at its place."""
+    pending: dict[Path, Path] = {}
+    try:
+        for path, content in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            aside = path.with_name(f".tmp-{os.getpid()}-{path.name}")
+            pending[path] = aside
+            aside.write_bytes(content)
+        for path, aside in pending.items():
+            os.replace(aside, path)
+    finally:
+        for aside in pending.values():
+            aside.unlink(missing_ok=True)
