@@ -610,6 +610,7 @@ def ablate(
     rows: dict[str, dict[str, Any]] = {}
     begin = time.perf_counter()
     hidden: list[float] = []
+    shown: list[int] = []
     columns: list[Float[Tensor, "height width 3"]] = []
     for name in names:
         row = ROWS[name]
@@ -621,9 +622,9 @@ def ablate(
             known = {kept: value for kept, value in known.items() if kept == "personal"}
             known[shape] = fitted_geometry(capture, shape, method, 0)
         hidden = known[shape].hidden
-        order = sorted(range(len(hidden)), key=lambda place: hidden[place])
-        shown = [order[0], order[len(order) // 2], order[-1]]
         if not columns:
+            order = sorted(range(len(hidden)), key=lambda place: hidden[place])
+            shown = [order[0], order[len(order) // 2], order[-1]]
             columns.append(_true_column(capture, [known[shape].views[n].frame for n in shown]))
         rows[name] = {}
         for seed in seeds:
