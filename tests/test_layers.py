@@ -29,7 +29,8 @@ MAY_IMPORT = {
         # Prior art, for a table alone.
         "peers": "geometry hand capture field render avatar evaluate train",
         "export": "geometry hand capture edit avatar",
-        "view": "geometry hand capture edit avatar",
+        # Its fluid pictures bake the fields on the mesh; its others are what `animate` makes.
+        "view": "geometry hand capture field render edit avatar animate",
         # What words and pictures mean to an avatar.
         "retouch": "hand capture edit avatar",
         "processes": "",

@@ -116,7 +116,7 @@ def render_motion(options: RenderOptions) -> Path:
     kernel = chosen_kernel(options.kernel, device)
     avatar = HandAvatar.load(options.run)
     edit = look.on(avatar)
-    motion = _chosen_motion(avatar, options.motion)
+    motion = chosen_motion(avatar, options.motion)
     poses = [motion.pose(step) for step in _spread(len(motion), options.frames)]
     camera = camera_on(avatar, poses, options.size)
     views = [camera] * len(poses)
@@ -347,7 +347,16 @@ class VideoWriter:
         self._container.close()
 
 
-def _chosen_motion(avatar: HandAvatar, name: str) -> Motion:
+def chosen_motion(avatar: HandAvatar, name: str) -> Motion:
+    """A built-in motion performed where the avatar's hand was seen, or that of a file.
+
+    Args:
+        avatar: knows the view of its capture.
+        name: of a built-in motion, or path of a motion file.
+
+    Raises:
+        CaptureError: if the file cannot be read.
+    """
     if name not in MOTIONS:
         return read_motion(Path(name))
     view = avatar.info.get("view")

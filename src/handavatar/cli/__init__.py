@@ -34,6 +34,7 @@ COMMANDS: dict[str, Command] = {
     "edit": avatar.edit,
     "bench": bench.bench,
     "render": avatar.render,
+    "view": avatar.view,
 }
 
 

@@ -1,4 +1,4 @@
-"""``handavatar train``, ``evaluate`` and ``render``: from a capture to pictures of new poses."""
+"""``handavatar train``, ``evaluate``, ``render`` and ``view``: from a capture to new pictures."""
 
 
 def train(words: list[str]) -> int:
@@ -40,4 +40,14 @@ def render(words: list[str]) -> int:
     folder = render_motion(parse(RenderOptions, words, "render", positional=("run",)))
     if is_first_process():
         print(folder)
+    return 0
+
+
+def view(words: list[str]) -> int:
+    """Live in the browser: pose, camera, layers, light, skin, paint, shadow per finger."""
+    from handavatar.cli.arguments import parse
+    from handavatar.view.server import ViewOptions
+    from handavatar.view.server import view as serve
+
+    serve(parse(ViewOptions, words, "view", positional=("run",)))
     return 0
