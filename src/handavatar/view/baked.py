@@ -9,7 +9,7 @@ from collections import OrderedDict
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar, Rendering
@@ -20,10 +20,12 @@ from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import SurfacePoints, subdivide_midpoint, vertex_normals
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand
-from handavatar.render.rasterize import interpolate, rasterize
+from handavatar.render.rasterize import Fragments, interpolate, rasterize
 
-NUM_PROBES = 512
+NUM_PROBES = 128
 """So many anchors are asked what lies around them; the others take it from the nearest."""
+NUM_LIT = 2048
+"""The light is decoded on so many anchors; the vertices take it from the nearest."""
 _KEPT = 8
 
 
@@ -33,15 +35,19 @@ class BakedPose:
 
     Attributes:
         posed: the hand; its offsets are those of the coarse mesh, carried to the fine one.
-        normals: unit, world.
-        anchor_normals: unit, world.
-        surroundings: soft occupancy of every part at the anchors.
+        vertices: its own and the middle of the wrist's cut, metres, world.
+        normals: of its own vertices, unit, world.
+        lit_normals: of the lit anchors, unit, world.
+        surroundings: soft occupancy of every part at the lit anchors.
+        lights: at the vertices, by which bones are lifted; filled as pictures need it.
     """
 
     posed: PosedHand
+    vertices: Float[Tensor, "sealed_vertices 3"]
     normals: Float[Tensor, "vertices 3"]
-    anchor_normals: Float[Tensor, "anchors 3"]
-    surroundings: Float[Tensor, "anchors bones"]
+    lit_normals: Float[Tensor, "lit 3"]
+    surroundings: Float[Tensor, "lit bones"]
+    lights: dict[tuple[int, ...], Float[Tensor, "vertices"]]
 
 
 class BakedAvatar:
@@ -63,12 +69,16 @@ class BakedAvatar:
         self._anchors = SurfacePoints(avatar.anchor_corners, avatar.anchor_barycentric)
         template = avatar.rig.template_vertices
         places = self._anchors.positions(template)
-        step = max(len(places) // NUM_PROBES, 1)
-        self._probes = torch.arange(0, len(places), step, device=avatar.device)
+        every = max(len(places) // NUM_LIT, 1)
+        lit = places[::every]
+        self._lit = SurfacePoints(self._anchors.faces[::every], self._anchors.barycentric[::every])
+        every = max(len(lit) // NUM_PROBES, 1)
+        self._probes = SurfacePoints(self._lit.faces[::every], self._lit.barycentric[::every])
         with torch.no_grad():
             self._at_vertices = nearest_anchors(places, template)
-            self._at_anchors = nearest_anchors(places, places)
-            self._from_probes = nearest_anchors(places[self._probes], places)
+            self._at_lit = nearest_anchors(places, lit)
+            self._from_lit = nearest_anchors(lit, template)
+            self._from_probes = nearest_anchors(lit[::every], lit)
             self._albedo = avatar.albedo(self._at_vertices)
         self._levels = []
         faces, count = avatar.base_rig.faces, avatar.base_rig.num_vertices
@@ -89,15 +99,25 @@ class BakedAvatar:
             edit: changes of the look.
         """
         baked = self.posed(pose)
-        faces = self._avatar.rig.faces
         edit = self._avatar.edit.then(edit)
         albedo = edit.painted(edit.of_albedo(self._albedo), self._at_vertices)
-        light = self._at_vertices.interpolated(self._light(baked, edit)[:, None])
+        light = edit.of_illumination(self._light(baked, edit))[:, None]
         values = torch.cat([albedo * light, albedo, light, baked.normals], dim=-1)
-        fragments = rasterize(baked.posed.vertices, faces, camera.to(self._avatar.device))
-        seen = interpolate(fragments, faces, values)
+        cut = values[self._avatar.rig.rim].mean(0, keepdim=True)
+        camera = camera.to(self._avatar.device)
+        faces = self._facing(baked.vertices, camera)
+        fragments = rasterize(baked.vertices, faces, camera)
+        mask = fragments.mask
+        # Most pixels see nothing; a row of those that do is a picture, too.
+        covered = Fragments(
+            fragments.face_index[mask][None],
+            fragments.depth[mask][None],
+            fragments.barycentric[mask][None],
+        )
+        seen = values.new_zeros(*mask.shape, values.shape[1])
+        seen[mask] = interpolate(covered, faces, torch.cat([values, cut]))[0]
         color, albedo, light, normal = seen.split([3, 3, 1, 3], dim=-1)
-        alpha = fragments.mask.to(color)
+        alpha = mask.to(color)
         return Rendering(color, albedo, light[..., 0], normal, torch.zeros_like(alpha), alpha)
 
     @torch.no_grad()
@@ -121,7 +141,7 @@ class BakedAvatar:
             row: of the pixel, from 0.
         """
         vertices = self.posed(pose).posed.vertices
-        pixel = camera.to(vertices.device).cropped(column, row, 1, 1)
+        pixel = camera.to(vertices.device).cropped(float(column), float(row), 1.0, 1.0)
         fragments = rasterize(vertices, self._avatar.rig.faces, pixel)
         if not bool(fragments.mask[0, 0]):
             return None
@@ -144,36 +164,48 @@ class BakedAvatar:
             offsets = level.carried(offsets)
         posed = personal_hand(avatar.rig.shaped(avatar.coefficients), offsets).posed(pose)
         normals = vertex_normals(posed.vertices, avatar.rig.faces)
-        anchor_normals = torch.nn.functional.normalize(self._anchors.positions(normals), dim=-1)
+        lit_normals = torch.nn.functional.normalize(self._lit.positions(normals), dim=-1)
         chosen = avatar.illumination.chosen
-        surroundings = anchor_normals.new_zeros(len(anchor_normals), len(pose.rotations))
+        surroundings = lit_normals.new_zeros(len(lit_normals), len(pose.rotations))
         if chosen.num_directions == 0 and chosen.name != "plain":
             codes = avatar.occupancy.encode(avatar.parts, posed)
-            probes = self._anchors.positions(posed.vertices)[self._probes]
-            around = avatar.occupancy(codes, probes).soft_parts
+            around = avatar.occupancy(codes, self._probes.positions(posed.vertices)).soft_parts
             surroundings = self._from_probes.interpolated(around)
-        return BakedPose(posed, normals, anchor_normals, surroundings)
+        return BakedPose(posed, posed.sealed_vertices, normals, lit_normals, surroundings, {})
 
-    def _light(self, baked: BakedPose, edit: Edit) -> Float[Tensor, "anchors"]:
-        field = self._avatar.illumination
-        traced = baked.anchor_normals @ field.directions.T
-        if traced.shape[1]:
-            traced = traced.clamp_min(0) * self._visibility(edit.lifted_bones)
-        light = field(
-            baked.posed.pose.rotations,
-            self._at_anchors,
-            edit.of_directed(baked.surroundings),
-            baked.anchor_normals,
-            traced,
-        )
-        return edit.of_illumination(light)
+    def _facing(
+        self, vertices: Float[Tensor, "sealed_vertices 3"], camera: Camera
+    ) -> Int[Tensor, "faces 3"]:
+        """The sealed mesh's faces that look to the camera: the others are behind them."""
+        faces = self._avatar.rig.sealed_faces
+        rotation, translation = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
+        a, b, c = (vertices + rotation.T @ translation)[faces].unbind(1)
+        return faces[(torch.linalg.cross(b - a, c - a) * a).sum(-1) < 0]
 
-    def _visibility(self, lifted: tuple[int, ...]) -> Float[Tensor, "anchors directions"]:
-        """Which share of a light in each direction reaches each anchor, in the first pose."""
+    def _light(self, baked: BakedPose, edit: Edit) -> Float[Tensor, "vertices"]:
+        """The illumination at the vertices, before its gain."""
+        if edit.lifted_bones not in baked.lights:
+            field = self._avatar.illumination
+            traced = baked.lit_normals @ field.directions.T
+            if traced.shape[1]:
+                traced = traced.clamp_min(0) * self._visibility(edit.lifted_bones)
+            light = field(
+                baked.posed.pose.rotations,
+                self._at_lit,
+                edit.of_directed(baked.surroundings),
+                baked.lit_normals,
+                traced,
+            )
+            baked.lights[edit.lifted_bones] = self._from_lit.interpolated(light[:, None])[:, 0]
+        return baked.lights[edit.lifted_bones]
+
+    def _visibility(self, lifted: tuple[int, ...]) -> Float[Tensor, "lit directions"]:
+        """Which share of a light in each direction reaches each lit anchor, in the first pose."""
         if lifted not in self._visible:
             state = self._avatar.prepare(self._first, lifted)
-            cosine = state.anchor_normals @ self._avatar.illumination.directions.T
-            share = (state.light / cosine.clamp_min(1e-3)).clamp(0, 1)
+            every = len(state.anchors) // len(self._lit.faces)
+            cosine = state.anchor_normals[::every] @ self._avatar.illumination.directions.T
+            share = (state.light[::every] / cosine.clamp_min(1e-3)).clamp(0, 1)
             self._visible[lifted] = torch.where(cosine > 0, share, 1.0)
             while len(self._visible) > _KEPT:
                 self._visible.popitem(last=False)

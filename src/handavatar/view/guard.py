@@ -87,7 +87,11 @@ def guard_of(host: str, token: str) -> Guard:
     Raises:
         ValueError: for a token that no address can carry.
     """
-    if token and (len(token) > _MOST_TOKEN or not all(c.isalnum() or c in "-_" for c in token)):
+    if token and (
+        len(token) > _MOST_TOKEN
+        or not token.replace("-", "").replace("_", "").isalnum()
+        or not token.isascii()
+    ):
         raise ValueError("--token: expected letters, digits, - and _, at most 200")
     if is_loopback(host):
         return Guard(host, token)

@@ -13,7 +13,7 @@ from handavatar.edit import bones_named
 from handavatar.hand.pose import FINGER_BONES, NUM_BONES
 
 LAYERS = ("rgb", "albedo", "illumination", "normal", "mesh")
-SIZES = (128, 192, 256, 384, 512)
+SIZES = (64, 128, 192, 256, 384, 512)
 MOST_STROKES = 400
 MOST_STEPS = 100_000
 MOST_ANCHORS = 1_000_000
@@ -136,27 +136,27 @@ def read_scene(content: Any) -> Scene:
     Raises:
         SceneError: what is wrong with it.
     """
-    fields = _fields(
+    given = fields(
         content, "scene", ("moment", "angles", "turn", "orbit", "layer", "size", "touches")
     )
-    angles = fields.get("angles")
+    angles = given.get("angles")
     if angles is not None:
         rows = _list(angles, "angles", NUM_BONES)
         angles = tuple(_degrees(row, "angles") for row in rows)
         if len(angles) != NUM_BONES:
             raise SceneError(f"angles: expected {NUM_BONES} rows, found {len(angles)}")
-    moment = fields.get("moment")
-    size = whole(fields.get("size", 256), "size", SIZES[0], SIZES[-1])
+    moment = given.get("moment")
+    size = whole(given.get("size", 256), "size", SIZES[0], SIZES[-1])
     if size not in SIZES:
         raise SceneError(f"size: expected one of {SIZES}, found {size}")
     return Scene(
         None if moment is None else read_moment(moment),
         angles,
-        _degrees(fields.get("turn", [0, 0, 0]), "turn"),
-        _orbit(fields.get("orbit", {})),
-        _word(fields.get("layer", "rgb"), "layer", LAYERS),
+        _degrees(given.get("turn", [0, 0, 0]), "turn"),
+        _orbit(given.get("orbit", {})),
+        _word(given.get("layer", "rgb"), "layer", LAYERS),
         size,
-        read_touches(fields.get("touches", {})),
+        read_touches(given.get("touches", {})),
     )
 
 
@@ -166,11 +166,11 @@ def read_moment(content: Any) -> Moment:
     Raises:
         SceneError: what is wrong with it.
     """
-    fields = _fields(content, "moment", ("motion", "step"))
-    name = fields.get("motion")
+    given = fields(content, "moment", ("motion", "step"))
+    name = given.get("motion")
     if not isinstance(name, str) or not 0 < len(name) <= _NAME_LENGTH:
         raise SceneError(f"motion: expected a name, found {_short(name)}")
-    return Moment(name, whole(fields.get("step", 0), "step", 0, MOST_STEPS))
+    return Moment(name, whole(given.get("step", 0), "step", 0, MOST_STEPS))
 
 
 def read_touches(content: Any) -> Touches:
@@ -179,21 +179,34 @@ def read_touches(content: Any) -> Touches:
     Raises:
         SceneError: what is wrong with them.
     """
-    fields = _fields(content, "touches", ("light_gain", "albedo_shift", "lift_shadow", "strokes"))
-    names = _list(fields.get("lift_shadow", []), "lift_shadow", NUM_BONES)
+    given = fields(content, "touches", ("light_gain", "albedo_shift", "lift_shadow", "strokes"))
+    names = _list(given.get("lift_shadow", []), "lift_shadow", NUM_BONES)
     if not all(isinstance(name, str) for name in names):
         raise SceneError("lift_shadow: expected names of fingers or bones")
     try:
         bones = bones_named(tuple(names))
     except ValueError as error:
         raise SceneError(f"lift_shadow: choose among {', '.join(FINGER_BONES)}") from error
-    strokes = _list(fields.get("strokes", []), "strokes", MOST_STROKES)
+    strokes = _list(given.get("strokes", []), "strokes", MOST_STROKES)
     return Touches(
-        number(fields.get("light_gain", 1.0), "light_gain", 0.0, 10.0),
-        _triple(fields.get("albedo_shift", [0, 0, 0]), "albedo_shift", -1.0, 1.0),
+        number(given.get("light_gain", 1.0), "light_gain", 0.0, 10.0),
+        _triple(given.get("albedo_shift", [0, 0, 0]), "albedo_shift", -1.0, 1.0),
         bones,
         tuple(_stroke(stroke) for stroke in strokes),
     )
+
+
+def fields(value: Any, name: str, known: tuple[str, ...]) -> dict[str, Any]:
+    """An object with no names but the known ones.
+
+    Raises:
+        SceneError: if it is none.
+    """
+    if not isinstance(value, dict):
+        raise SceneError(f"{name}: expected an object, found {_short(value)}")
+    if unknown := set(value) - set(known):
+        raise SceneError(f"{name}: there is no {_short(sorted(unknown)[0])}")
+    return value
 
 
 def number(value: Any, name: str, least: float, greatest: float) -> float:
@@ -222,24 +235,24 @@ def whole(value: Any, name: str, least: int, greatest: int) -> int:
 
 
 def _orbit(content: Any) -> Orbit:
-    fields = _fields(content, "orbit", ("azimuth", "elevation", "zoom", "shift"))
-    shift = _list(fields.get("shift", [0, 0]), "shift", 2)
+    given = fields(content, "orbit", ("azimuth", "elevation", "zoom", "shift"))
+    shift = _list(given.get("shift", [0, 0]), "shift", 2)
     if len(shift) != 2:
         raise SceneError(f"shift: expected two numbers, found {len(shift)}")
     return Orbit(
-        math.radians(number(fields.get("azimuth", 0), "azimuth", -3600, 3600)),
-        math.radians(number(fields.get("elevation", 0), "elevation", -90, 90)),
-        number(fields.get("zoom", 1), "zoom", 0.25, 8),
-        (number(shift[0], "shift", -4, 4), number(shift[1], "shift", -4, 4)),
+        math.radians(number(given.get("azimuth", 0), "azimuth", -3600.0, 3600.0)),
+        math.radians(number(given.get("elevation", 0), "elevation", -90.0, 90.0)),
+        number(given.get("zoom", 1), "zoom", 0.25, 8.0),
+        (number(shift[0], "shift", -4.0, 4.0), number(shift[1], "shift", -4.0, 4.0)),
     )
 
 
 def _stroke(content: Any) -> Stroke:
-    fields = _fields(content, "stroke", ("anchor", "radius", "color"))
+    given = fields(content, "stroke", ("anchor", "radius", "color"))
     return Stroke(
-        whole(fields.get("anchor"), "anchor", 0, MOST_ANCHORS),
-        number(fields.get("radius"), "radius", 1, 30) / 1000,
-        _triple(fields.get("color"), "color", 0.0, 1.0),
+        whole(given.get("anchor"), "anchor", 0, MOST_ANCHORS),
+        number(given.get("radius"), "radius", 1.0, 30.0) / 1000,
+        _triple(given.get("color"), "color", 0.0, 1.0),
     )
 
 
@@ -259,14 +272,6 @@ def _triple(value: Any, name: str, least: float, greatest: float) -> tuple[float
 def _list(value: Any, name: str, most: int) -> list[Any]:
     if not isinstance(value, list) or len(value) > most:
         raise SceneError(f"{name}: expected a list of at most {most}, found {_short(value)}")
-    return value
-
-
-def _fields(value: Any, name: str, known: tuple[str, ...]) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise SceneError(f"{name}: expected an object, found {_short(value)}")
-    if unknown := set(value) - set(known):
-        raise SceneError(f"{name}: there is no {_short(sorted(unknown)[0])}")
     return value
 
 

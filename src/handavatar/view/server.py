@@ -13,7 +13,8 @@ import socket
 import socketserver
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -21,14 +22,18 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from handavatar.avatar import HandAvatar, chosen_device
+import torch
+
+from handavatar.avatar import HandAvatar, RenderSettings, chosen_device
 from handavatar.capture.motion import MOTIONS, Motion, read_motion
+from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.view.films import FilmOrder, Films
 from handavatar.view.guard import Guard, Refused, guard_of, is_loopback
 from handavatar.view.scene import (
     MOST_STEPS,
     Moment,
     SceneError,
+    fields,
     number,
     read_json,
     read_scene,
@@ -41,6 +46,8 @@ from handavatar.view.turns import Busy, Job, Overtaken, Turns
 MOST_BYTES = 64 * 1024
 """Of a request's body."""
 MOST_CONNECTIONS = 160
+MOST_WAITING = 64
+"""Clients whose picture has not been begun; more are asked to try again."""
 MOST_PORTS = 20
 """Ports that are tried, from the one that is asked for."""
 _TIMEOUT = 20.0
@@ -73,6 +80,7 @@ class ViewOptions:
         motion: motion files for the timeline, besides the built-in motions.
         out: folder for avatars saved from the page; they get names that are free.
         device: where the fields run.
+        kernel: what decodes pairs of parts, as for ``handavatar render``.
     """
 
     run: Path
@@ -82,6 +90,7 @@ class ViewOptions:
     motion: tuple[Path, ...] = ()
     out: Path = Path("edited")
     device: str = "auto"
+    kernel: Kernel = "torch"
 
 
 class ViewServer:
@@ -102,8 +111,13 @@ class ViewServer:
         self._http = _bound(guard.host, port)
         self.port: int = self._http.server_address[1]
         self.guard = replace(guard, cookie=f"{guard.cookie}-{self.port}")
-        self.turns = Turns(("fluid", "field"))
+        # One core for what must be there at once; torch's threads are of no use to it, and the
+        # field's pieces would have to be waited for.
+        self.turns = Turns(
+            {"fluid": lambda: torch.set_num_threads(1), "field": lambda: None}, MOST_WAITING
+        )
         self.films = Films(studio, self.turns)
+        self.out = out
         self._http.answers = Answers(studio, self.turns, self.films, self.guard, out)
 
     @property
@@ -132,6 +146,18 @@ class ViewServer:
         self.turns.close()
 
 
+@contextmanager
+def serving(server: ViewServer) -> Iterator[ViewServer]:
+    """A server that answers, from a thread of its own, as long as the block lasts."""
+    thread = threading.Thread(target=server.serve, name="view", daemon=True)
+    thread.start()
+    try:
+        yield server
+    finally:
+        server.close()
+        thread.join()
+
+
 def view(options: ViewOptions) -> None:
     """Serves until it is interrupted.
 
@@ -145,9 +171,10 @@ def view(options: ViewOptions) -> None:
         raise ValueError(f"--port {options.port}: expected 0 to 65535")
     guard = guard_of(options.host, options.token)
     device = chosen_device(options.device)
+    settings = RenderSettings(kernel=chosen_kernel(options.kernel, str(device)))
     motions = _named(options.motion)
     avatar = HandAvatar.load(options.run).moved_to(device)
-    server = ViewServer(Studio(avatar, motions), guard, options.port, options.out)
+    server = ViewServer(Studio(avatar, motions, settings), guard, options.port, options.out)
     if server.port != options.port and options.port:
         print(f"port {options.port} is taken; this is {server.port}", file=sys.stderr)
     if not is_loopback(guard.host):
@@ -268,6 +295,7 @@ class Answers:
         return known[path](read_json(body), is_gone)
 
     def _picture(self, content: dict[str, Any], is_gone: Callable[[], bool]) -> Answer:
+        fields(content, "picture", ("client", "order", "stage", "scene"))
         scene = read_scene(content.get("scene", {}))
         stage = STAGES[whole(content.get("stage", 0), "stage", 0, len(STAGES) - 1)]
         self._studio.shot(scene)  # What it names that there is not is refused before it waits.
@@ -284,8 +312,9 @@ class Answers:
         return Answer(_waited(job, is_gone), kind)
 
     def _pick(self, content: dict[str, Any], is_gone: Callable[[], bool]) -> Answer:
+        fields(content, "pick", ("client", "order", "scene", "x", "y"))
         scene = read_scene(content.get("scene", {}))
-        x, y = (number(content.get(name), name, 0, 1) for name in ("x", "y"))
+        x, y = (number(content.get(name), name, 0.0, 1.0) for name in ("x", "y"))
         self._studio.shot(scene)
         client = f"pick {_client(content)}"
         job = self._turns.submit(
@@ -294,11 +323,13 @@ class Answers:
         return _json({"anchor": _waited(job, is_gone)})
 
     def _avatar(self, content: dict[str, Any], _: Callable[[], bool]) -> Answer:
+        fields(content, "avatar", ("touches",))
         with self._saving:
             path = self._studio.save(read_touches(content.get("touches", {})), self._out)
         return _json({"path": str(path)})
 
     def _film(self, content: dict[str, Any], _: Callable[[], bool]) -> Answer:
+        fields(content, "film", ("scene", "stage", "every"))
         scene = read_scene(content.get("scene", {}))
         if scene.moment is None:
             raise SceneError("a video needs a motion: choose one")

@@ -44,9 +44,7 @@ from handavatar.view.scene import LAYERS, SIZES, Moment, Orbit, Scene, SceneErro
 STAGES = ("fluid", "half", "full")
 FLUID_SIZE = 256
 """The fluid picture has at most so many pixels along a side."""
-HALF = RenderSettings(num_samples=32, edge_rays=1)
-"""How the field is evaluated at half the size, while the full picture is not there yet."""
-MOST_SAVED = 1000
+MOST_SAVED = 100
 Pixels = UInt8[np.ndarray, "size size 3"]
 _KEPT_PAINTS = 8
 
@@ -77,13 +75,21 @@ class Studio:
     may run at once. All else may be called from any thread.
     """
 
-    def __init__(self, avatar: HandAvatar, motions: dict[str, Motion] | None = None) -> None:
+    def __init__(
+        self,
+        avatar: HandAvatar,
+        motions: dict[str, Motion] | None = None,
+        settings: RenderSettings | None = None,
+    ) -> None:
         """Sets the stage for an avatar, which is not changed.
 
         Args:
             avatar: its own edit is where pages begin.
             motions: by name, besides those that are built in.
+            settings: how the field is evaluated for a picture in full; by default as
+                :meth:`HandAvatar.render` does.
         """
+        self._settings = settings or RenderSettings()
         self._avatar = copy.copy(avatar)
         self._avatar.edit = Edit()
         self.start = avatar.edit
@@ -229,7 +235,10 @@ class Studio:
             with torch.no_grad():
                 vertices = self._avatar.personal(pose).posed(pose).vertices
             return self._mesh(vertices, shot.camera, 2)
-        rendering = self.rendering(shot, RenderSettings() if is_full else HALF, is_stale)
+        fast = replace(
+            self._settings, num_samples=self._settings.num_samples // 2 or 1, edge_rays=1
+        )
+        rendering = self.rendering(shot, self._settings if is_full else fast, is_stale)
         return pass_pictures(rendering, self.side)[scene.layer]
 
     def rendering(

@@ -2,7 +2,7 @@
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 _REMEMBERED = 1024
@@ -79,11 +79,11 @@ class Turns:
     ones stale in all lanes.
     """
 
-    def __init__(self, lanes: tuple[str, ...], most_waiting: int = 64) -> None:
+    def __init__(self, lanes: Mapping[str, Callable[[], None]], most_waiting: int = 64) -> None:
         """Starts the threads.
 
         Args:
-            lanes: names of the lanes.
+            lanes: names of the lanes, and what the thread of each does first.
             most_waiting: in each lane.
         """
         self._changed = threading.Condition()
@@ -93,8 +93,10 @@ class Turns:
         self._running: dict[str, Job | None] = dict.fromkeys(lanes)
         self._is_closed = False
         self._threads = [
-            threading.Thread(target=self._work, args=(name,), name=f"view-{name}", daemon=True)
-            for name in lanes
+            threading.Thread(
+                target=self._work, args=(name, begin), name=f"view-{name}", daemon=True
+            )
+            for name, begin in lanes.items()
         ]
         for thread in self._threads:
             thread.start()
@@ -148,7 +150,8 @@ class Turns:
         for thread in self._threads:
             thread.join()
 
-    def _work(self, lane: str) -> None:
+    def _work(self, lane: str, begin: Callable[[], None]) -> None:
+        begin()
         waiting = self._waiting[lane]
         while True:
             with self._changed:
