@@ -53,6 +53,7 @@ AT_LEAST = {
     "hand.skin_refinement": "RefinementOptions SkinRefinement refine_skin",
     "hand.sparse_skin": "SparseSkin SparseSkin.load SparseSkin.save",
     "evaluate.run": "EvaluateOptions evaluate_run",
+    "view.server": "ViewOptions view",
     "doctor": "Finding examine",
     "cli": "main",
 }

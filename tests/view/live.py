@@ -11,7 +11,7 @@ from handavatar.view.guard import guard_of
 from handavatar.view.server import ViewServer, serving
 from handavatar.view.studio import Studio
 
-FEW = RenderSettings(num_samples=12, edge_rays=1)
+FEW = RenderSettings(num_samples=6, coarse=2, edge_rays=1)
 
 
 def wave() -> Motion:

@@ -1,8 +1,7 @@
 """``handavatar view``: an HTTP server of its own, for a page of its own; nothing else is loaded.
 
-Departs: no viewer library. Viser's server takes no list of allowed origins, and lets every page
-    that reaches it ask for a public tunnel; a proxy in front would leave its own port open to all
-    pages of the browser. A picture also needs no WebGL. See docs/viewer.md.
+Of no viewer library, because none checks who asks; docs/viewer.md says more. A page sends its whole
+scene with every wish for a picture, so the server keeps nothing of a client but its newest order.
 """
 
 import errno
@@ -14,7 +13,7 @@ import socketserver
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
@@ -55,6 +54,7 @@ _PAGE = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/page.js": ("page.js", "text/javascript; charset=utf-8"),
     "/page.css": ("page.css", "text/css; charset=utf-8"),
+    "/icon.svg": ("icon.svg", "image/svg+xml"),
 }
 _HEADERS = {
     "Cache-Control": "no-store",
@@ -111,10 +111,15 @@ class ViewServer:
         self._http = _bound(guard.host, port)
         self.port: int = self._http.server_address[1]
         self.guard = replace(guard, cookie=f"{guard.cookie}-{self.port}")
-        # One core for what must be there at once; torch's threads are of no use to it, and the
-        # field's pieces would have to be waited for.
+        # One core for what must be there at once: torch's threads are of no use to it, and it would
+        # wait for the field's pieces. Torch would give the other lane the number last set.
+        cores = torch.get_num_threads()
         self.turns = Turns(
-            {"fluid": lambda: torch.set_num_threads(1), "field": lambda: None}, MOST_WAITING
+            {
+                "fluid": lambda: torch.set_num_threads(1),
+                "field": lambda: torch.set_num_threads(cores),
+            },
+            MOST_WAITING,
         )
         self.films = Films(studio, self.turns)
         self.out = out
@@ -142,6 +147,7 @@ class ViewServer:
     def release(self) -> None:
         """As :meth:`close`, where nothing is answered any more."""
         self._http.server_close()
+        self._http.hang_up()
         self.films.close()
         self.turns.close()
 
@@ -351,6 +357,7 @@ class _Http(ThreadingHTTPServer):
 
     def __init__(self, address: tuple[str, int]) -> None:
         self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
+        self._open: set[socket.socket] = set()
         super().__init__(address, _Handler)
 
     def server_bind(self) -> None:
@@ -360,6 +367,7 @@ class _Http(ThreadingHTTPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         if self._free.acquire(blocking=False):
+            self._open.add(request)
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
@@ -368,7 +376,14 @@ class _Http(ThreadingHTTPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
+            self._open.discard(request)
             self._free.release()
+
+    def hang_up(self) -> None:
+        """Ends the connections that are open; what waits for an answer gets none."""
+        for connection in list(self._open):
+            with suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A connection that broke; what a request asked for never ends here."""

@@ -75,7 +75,7 @@ async function drawForever() {
       drawn = wish;
     } catch (error) {
       if (error.name !== "AbortError") {
-        tell(error.message);
+        tell(error instanceof TypeError ? "the server does not answer; asking again" : error.message);
         await new Promise((wake) => setTimeout(wake, 700));
         // A wish that means nothing stays so; one that nobody answered is repeated.
         if (error instanceof TypeError || /again/.test(error.message)) continue;
