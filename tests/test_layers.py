@@ -30,7 +30,8 @@ MAY_IMPORT = {
         "peers": "geometry hand capture field render avatar evaluate train",
         # A texture's chart is rasterised; words of an edit mean what they mean elsewhere.
         "export": "geometry hand capture field render edit avatar retouch",
-        "view": "geometry hand capture edit avatar",
+        # Its fluid pictures bake the fields on the mesh; its others are what `animate` makes.
+        "view": "geometry hand capture field render edit avatar animate",
         # What words and pictures mean to an avatar.
         "retouch": "hand capture edit avatar",
         "processes": "",

@@ -56,6 +56,7 @@ AT_LEAST = {
     "export.run": "ExportOptions export_avatar",
     "export.rigged": "skinned_mesh mirrored",
     "export.gltf": "Clip SkinnedMesh glb_bytes",
+    "view.server": "ViewOptions view",
     "doctor": "Finding examine",
     "cli": "main",
 }

@@ -35,6 +35,7 @@ COMMANDS: dict[str, Command] = {
     "bench": bench.bench,
     "render": avatar.render,
     "export": avatar.export,
+    "view": avatar.view,
 }
 
 

@@ -1,4 +1,4 @@
-"""``handavatar train``, ``evaluate``, ``edit``, ``render`` and ``export``: an avatar's life."""
+"""From a capture to an avatar, and all that is done with one: train, evaluate, render, ..."""
 
 
 def train(words: list[str]) -> int:
@@ -49,4 +49,14 @@ def export(words: list[str]) -> int:
     from handavatar.export.run import ExportOptions, export_avatar
 
     print(export_avatar(parse(ExportOptions, words, "export", positional=("run", "format"))))
+    return 0
+
+
+def view(words: list[str]) -> int:
+    """Live in the browser: pose, camera, layers, light, skin, paint, shadow per finger."""
+    from handavatar.cli.arguments import parse
+    from handavatar.view.server import ViewOptions
+    from handavatar.view.server import view as serve
+
+    serve(parse(ViewOptions, words, "view", positional=("run",)))
     return 0

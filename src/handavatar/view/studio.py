@@ -1,0 +1,414 @@
+"""From a scene to pictures: fluid at once, then the field at half the size, then in full."""
+
+import copy
+import io
+import os
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from PIL import Image
+from torch import Tensor
+
+from handavatar.animate import camera_on, pass_pictures
+from handavatar.avatar import HandAvatar, Rendering, RenderSettings
+from handavatar.capture.motion import (
+    MORE_GESTURES,
+    MOTIONS,
+    Motion,
+    gesture,
+    middle_of_hand,
+    named_motion,
+    placed,
+)
+from handavatar.capture.view import start_of
+from handavatar.edit import Edit, Paint
+from handavatar.geometry.cameras import Camera
+from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.hand.pose import BONE_NAMES, FINGER_BONES, HandPose
+from handavatar.hand.pose_sampling import (
+    GESTURES,
+    JOINT_LIMITS,
+    angles_from_rotations,
+    rotations_from_angles,
+)
+from handavatar.render.shaded import shaded_mesh
+from handavatar.view.baked import BakedAvatar, dabbed
+from handavatar.view.scene import LAYERS, SIZES, Moment, Orbit, Scene, SceneError, Stroke, Touches
+
+STAGES = ("fluid", "half", "full")
+FLUID_SIZE = 256
+"""The fluid picture has at most so many pixels along a side."""
+MOST_SAVED = 100
+Pixels = UInt8[np.ndarray, "size size 3"]
+_KEPT_PAINTS = 8
+
+
+class Interrupted(Exception):
+    """Nobody waits for this picture any more."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A scene as the renderer takes it.
+
+    Attributes:
+        pose: of the hand in the world.
+        camera: of the finished picture; of a left hand's, before it is mirrored.
+        edit: whole; the avatar's own plays no part.
+    """
+
+    pose: HandPose
+    camera: Camera
+    edit: Edit
+
+
+class Studio:
+    """One avatar, the motions it knows, and its pictures.
+
+    :meth:`fluid` and :meth:`nearest_anchor` belong to one thread, :meth:`refined` to another; both
+    may run at once. All else may be called from any thread.
+    """
+
+    def __init__(
+        self,
+        avatar: HandAvatar,
+        motions: dict[str, Motion] | None = None,
+        settings: RenderSettings | None = None,
+    ) -> None:
+        """Sets the stage for an avatar, which is not changed.
+
+        Args:
+            avatar: its own edit is where pages begin.
+            motions: by name, besides those that are built in.
+            settings: how the field is evaluated for a picture in full; by default as
+                :meth:`HandAvatar.render` does.
+        """
+        self._settings = settings or RenderSettings()
+        self._avatar = copy.copy(avatar)
+        self._avatar.edit = Edit()
+        self.start = avatar.edit
+        self.side = str(avatar.info.get("side", "right"))
+        # The rest hand and its joints answer small questions, on the CPU and from any thread.
+        self._rig = avatar.base_rig.to("cpu")
+        self._first = start_of(avatar.info.get("view"))
+        self._motions = dict(motions or {})
+        self._frames: dict[tuple[str | None, int], tuple[Camera, Tensor]] = {}
+        self._making_motions = threading.Lock()
+        self._mixing_paint = threading.Lock()
+        # A module of its own: the other one's evaluations can be interrupted.
+        self._baked = BakedAvatar(copy.deepcopy(self._avatar), self._first)
+        self._places, self._normals = self._baked.template_anchors()
+        self._paints: OrderedDict[tuple[Any, ...], Paint | None] = OrderedDict()
+
+    def about(self) -> dict[str, Any]:
+        """What a page needs to know, as JSON; angles in degrees."""
+        known = {**GESTURES, **MORE_GESTURES}
+        joints = [
+            {
+                "bone": bone,
+                "angle": angle,
+                "finger": name[:-1],
+                "label": f"{name} {kind}",
+                "least": getattr(JOINT_LIMITS[name], kind)[0],
+                "greatest": getattr(JOINT_LIMITS[name], kind)[1],
+            }
+            for bone, name in enumerate(BONE_NAMES)
+            if name in JOINT_LIMITS
+            for angle, kind in enumerate(("flexion", "abduction", "twist"))
+            if getattr(JOINT_LIMITS[name], kind) != (0.0, 0.0)
+        ]
+        lifted = set(self.start.lifted_bones)
+        return {
+            "side": self.side,
+            "subject": str(self._avatar.info.get("subject", "")),
+            "layers": list(LAYERS),
+            "sizes": list(SIZES),
+            "stages": list(STAGES),
+            "joints": joints,
+            "fingers": list(FINGER_BONES),
+            "angles": self.angles(None),
+            "gestures": {name: self._degrees(gesture(self._rig, name)) for name in known},
+            "motions": [*self._motions, *(name for name in MOTIONS if name not in self._motions)],
+            "touches": {
+                "light_gain": self.start.light_gain,
+                "albedo_shift": list(self.start.albedo_shift),
+                "lift_shadow": [BONE_NAMES[bone] for bone in sorted(lifted)],
+                "strokes": [],
+            },
+            "finger_bones": {
+                finger: [BONE_NAMES[bone] for bone in bones]
+                for finger, bones in FINGER_BONES.items()
+            },
+        }
+
+    def motion(self, name: str) -> Motion:
+        """A motion by name; built-in ones are made when they are first asked for.
+
+        Raises:
+            SceneError: if there is none.
+        """
+        if name not in self._motions:
+            if name not in MOTIONS:
+                raise SceneError(f"there is no motion {ascii(name)[:40]}")
+            with self._making_motions:
+                if name not in self._motions:
+                    self._motions[name] = named_motion(self._rig, name, self._first)
+        return self._motions[name]
+
+    def angles(self, moment: Moment | None) -> list[list[float]]:
+        """Flexion, abduction and twist of every bone at a moment, degrees; the wrist's are zero.
+
+        Raises:
+            SceneError: if there is no such moment.
+        """
+        return self._degrees(self._at(moment).rotations)
+
+    def shot(self, scene: Scene) -> Shot:
+        """What the renderer needs for a scene.
+
+        Raises:
+            SceneError: if the scene names a moment or an anchor that there is not.
+        """
+        return Shot(self.pose(scene), self._camera(scene), self.edit(scene.touches))
+
+    def pose(self, scene: Scene) -> HandPose:
+        """The hand of a scene, in the world.
+
+        Raises:
+            SceneError: if there is no such moment.
+        """
+        pose = self._at(scene.moment)
+        if scene.angles is not None:
+            rotations = rotations_from_angles(self._rig, torch.tensor(scene.angles))
+            pose = replace(pose, rotations=torch.cat([pose.rotations[:1], rotations[1:]]))
+        if any(scene.turn):
+            wrist = matrix_from_axis_angle(pose.rotations[0])
+            turned = wrist @ matrix_from_axis_angle(torch.tensor(scene.turn))
+            middle = middle_of_hand(self._rig, pose)
+            pose = placed(self._rig, pose.rotations[None], turned[None], middle, 30.0).pose(0)
+        return pose
+
+    def edit(self, touches: Touches) -> Edit:
+        """The edit that a page's touches make of the untouched avatar.
+
+        Raises:
+            SceneError: if a stroke lies on an anchor that there is not.
+        """
+        return Edit(
+            touches.light_gain, touches.albedo_shift, touches.lifted_bones, self._paint(touches)
+        )
+
+    def fluid(self, scene: Scene) -> Pixels:
+        """The picture for a hand in motion, of at most ``FLUID_SIZE`` pixels.
+
+        Raises:
+            SceneError: as :meth:`shot`.
+        """
+        shot = self.shot(replace(scene, size=min(scene.size, FLUID_SIZE)))
+        if scene.layer == "mesh":
+            return self._mesh(self._baked.posed(shot.pose).posed.vertices, shot.camera, 1)
+        rendering = self._baked.render(shot.pose, shot.camera, shot.edit)
+        return pass_pictures(rendering, self.side)[scene.layer]
+
+    def refined(self, scene: Scene, stage: str, is_stale: Callable[[], bool]) -> Pixels:
+        """The picture by the field; the last stage is what ``handavatar render`` gives.
+
+        Args:
+            scene: what is to be seen.
+            stage: ``half`` or ``full``.
+            is_stale: asked every few milliseconds whether to go on.
+
+        Raises:
+            Interrupted: as soon as it is stale.
+            SceneError: as :meth:`shot`.
+        """
+        is_full = stage == STAGES[-1]
+        shot = self.shot(scene if is_full else replace(scene, size=scene.size // 2))
+        if scene.layer == "mesh":
+            pose = shot.pose.to(self._avatar.device)
+            with torch.no_grad():
+                vertices = self._avatar.personal(pose).posed(pose).vertices
+            return self._mesh(vertices, shot.camera, 2)
+        fast = replace(
+            self._settings, num_samples=self._settings.num_samples // 2 or 1, edge_rays=1
+        )
+        rendering = self.rendering(shot, self._settings if is_full else fast, is_stale)
+        return pass_pictures(rendering, self.side)[scene.layer]
+
+    def rendering(
+        self, shot: Shot, settings: RenderSettings, is_stale: Callable[[], bool]
+    ) -> Rendering:
+        """:meth:`HandAvatar.render` of a shot, which ends as soon as it is stale.
+
+        Raises:
+            Interrupted: then.
+        """
+        with _interruptible(self._avatar, is_stale):
+            return self._avatar.render(shot.pose, shot.camera, shot.edit, settings)
+
+    def nearest_anchor(self, scene: Scene, x: float, y: float) -> int | None:
+        """The anchor under a point of the picture; None beside the hand.
+
+        Args:
+            scene: what is seen.
+            x: to the right, in widths of the picture.
+            y: down, in heights.
+        """
+        shot = self.shot(scene)
+        x = 1 - x if self.side == "left" else x
+        column, row = (min(int(share * scene.size), scene.size - 1) for share in (x, y))
+        return self._baked.nearest_anchor(shot.pose, shot.camera, column, row)
+
+    def save(self, touches: Touches, folder: Path) -> Path:
+        """Writes the avatar with a page's edits under a new name; no file is replaced.
+
+        Returns:
+            ``edited-001.safetensors`` in the folder, or with the first number that is free.
+
+        Raises:
+            SceneError: if a stroke lies on an anchor that there is not, or no number is free.
+        """
+        edited = copy.copy(self._avatar)
+        edited.edit = self.edit(touches)
+        folder.mkdir(parents=True, exist_ok=True)
+        aside = folder / f".edited-{os.getpid()}-{threading.get_ident()}.safetensors"
+        try:
+            edited.save(aside)
+            for number in range(1, MOST_SAVED + 1):
+                path = folder / f"edited-{number:03d}.safetensors"
+                try:
+                    os.link(aside, path)  # which fails where a file is
+                except FileExistsError:
+                    continue
+                return path
+        finally:
+            aside.unlink(missing_ok=True)
+        raise SceneError(f"{folder} holds {MOST_SAVED} edited avatars: move some away")
+
+    def _at(self, moment: Moment | None) -> HandPose:
+        if moment is None:
+            return self._first
+        motion = self.motion(moment.motion)
+        if moment.step >= len(motion):
+            raise SceneError(f"{moment.motion} has {len(motion)} steps, no step {moment.step}")
+        return motion.pose(moment.step)
+
+    def _camera(self, scene: Scene) -> Camera:
+        key = (None if scene.moment is None else scene.moment.motion, scene.size)
+        if key not in self._frames:
+            poses = self._framed(key[0])
+            middle = middle_of_hand(self._rig, poses[0])
+            self._frames[key] = camera_on(self._avatar, poses, scene.size), middle
+        return orbiting(*self._frames[key], scene.orbit, self.side == "left")
+
+    def _framed(self, name: str | None) -> list[HandPose]:
+        if name is not None:
+            motion = self.motion(name)
+            return [motion.pose(step) for step in range(len(motion))]
+        poses = [self._first]
+        for shape in ("spread", "flat", "fist"):
+            fingers = gesture(self._rig, shape)[1:]
+            rotations = torch.cat([self._first.rotations[:1], fingers])
+            poses.append(replace(self._first, rotations=rotations))
+        return poses
+
+    def _paint(self, touches: Touches) -> Paint | None:
+        with self._mixing_paint:
+            if touches.strokes not in self._paints:
+                self._paints[touches.strokes] = self._mixed(touches.strokes)
+                while len(self._paints) > _KEPT_PAINTS:
+                    self._paints.popitem(last=False)
+            return self._paints[touches.strokes]
+
+    def _mixed(self, strokes: tuple[Stroke, ...]) -> Paint | None:
+        paint = self.start.paint
+        for stroke in strokes:
+            if stroke.anchor >= len(self._places):
+                raise SceneError(
+                    f"anchor: expected one below {len(self._places)}, found {stroke.anchor}"
+                )
+            opacity = dabbed(self._places, self._normals, stroke.anchor, stroke.radius)
+            dab = Paint(opacity.new_tensor(stroke.color).expand(len(opacity), 3), opacity)
+            paint = dab if paint is None else dab.over(paint)
+        return paint
+
+    def _mesh(self, vertices: Float[Tensor, "vertices 3"], camera: Camera, samples: int) -> Pixels:
+        with torch.no_grad():
+            shown = shaded_mesh(
+                vertices, self._avatar.rig.faces, camera.to(vertices.device), samples
+            )
+        pixels = (shown.cpu() * 255).round().to(torch.uint8).numpy()
+        return np.ascontiguousarray(pixels[:, ::-1]) if self.side == "left" else pixels
+
+    def _degrees(self, rotations: Float[Tensor, "bones 3"]) -> list[list[float]]:
+        angles = angles_from_rotations(self._rig, rotations).rad2deg()
+        angles[0] = 0
+        return [[round(value, 3) for value in row] for row in angles.tolist()]
+
+
+def orbiting(
+    camera: Camera, middle: Float[Tensor, "3"], orbit: Orbit, is_mirrored: bool = False
+) -> Camera:
+    """A camera moved around a point, its picture zoomed and shifted.
+
+    Args:
+        camera: where it is by default.
+        middle: of the hand, world, metres.
+        orbit: as a person sees it.
+        is_mirrored: the person sees the mirror image of the camera's picture.
+    """
+    sign = -1.0 if is_mirrored else 1.0
+    if orbit.azimuth or orbit.elevation:
+        rotation, translation = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
+        # In the camera's axes: to walk to the right is to turn the hand to the left.
+        about_vertical = torch.tensor([0.0, -sign * orbit.azimuth, 0.0])
+        about_horizontal = torch.tensor([-orbit.elevation, 0.0, 0.0])
+        turn = matrix_from_axis_angle(about_horizontal) @ matrix_from_axis_angle(about_vertical)
+        center = rotation @ middle + translation
+        moved = torch.eye(4)
+        moved[:3, :3] = turn @ rotation
+        moved[:3, 3] = turn @ (translation - center) + center
+        camera = replace(camera, camera_from_world=moved)
+    if orbit.zoom != 1 or any(orbit.shift):
+        x, y = (
+            half + (at - half) * orbit.zoom + shift * 2 * half
+            for at, half, shift in (
+                (camera.center[0], camera.width / 2, sign * orbit.shift[0]),
+                (camera.center[1], camera.height / 2, orbit.shift[1]),
+            )
+        )
+        focal = (camera.focal[0] * orbit.zoom, camera.focal[1] * orbit.zoom)
+        camera = replace(camera, focal=focal, center=(x, y))
+    return camera
+
+
+def encoded(pixels: Pixels, kind: str) -> bytes:
+    """A picture file: ``PNG`` without loss, or ``JPEG`` at once."""
+    buffer = io.BytesIO()
+    options = {"quality": 92} if kind == "JPEG" else {}
+    Image.fromarray(pixels).save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+@contextmanager
+def _interruptible(avatar: HandAvatar, is_stale: Callable[[], bool]) -> Iterator[None]:
+    """While it lasts, evaluations of the avatar's occupancy end soon after they are stale."""
+
+    def stop_if_stale(*_: object) -> None:
+        if is_stale():
+            raise Interrupted
+
+    # The last network of the decoder runs once for each few hundred points.
+    handle = avatar.occupancy.decoder.mlp.register_forward_pre_hook(stop_if_stale)
+    try:
+        yield
+    finally:
+        handle.remove()
