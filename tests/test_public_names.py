@@ -7,7 +7,7 @@ modules in the second, only these names are promised; the rest may change.
 import ast
 
 import pytest
-from source_tree import find_definition, modules
+from source_tree import TOP, find_definition, imported_modules, modules
 
 EXACTLY = {
     "geometry.cameras": (
@@ -38,6 +38,7 @@ EXACTLY = {
     "capture.default": "default_capture",
 }
 AT_LEAST = {
+    "animate": "RenderOptions render_motion camera_on orbited pass_pictures",
     "avatar": "HandAvatar.load HandAvatar.render HandAvatar.save",
     "hand.pose": "HandPose.flat",
     "hand.rig": "Rig.shaped ShapedHand.posed",
@@ -46,17 +47,29 @@ AT_LEAST = {
         "write_capture"
     ),
     "capture.checks": "CaptureError",
+    "capture.motion": (
+        "Motion Motion.pose gesture middle_of_hand named_motion open_motion read_motion "
+        "write_motion"
+    ),
+    "capture.view": "start_of",
     "capture.video": "VideoOptions capture_video",
     "capture.synthetic": "SynthOptions make_capture",
     "train.loop": "TrainOptions train",
     "train.prior": "PriorOptions train_prior PriorEvaluationOptions evaluate_prior open_prior",
+    "hand.pose_sampling": (
+        "angles_from_rotations clamped_angles interpolate_rotations "
+        "resolve_penetration rotations_from_angles"
+    ),
     "hand.skin_refinement": "RefinementOptions SkinRefinement refine_skin",
     "hand.sparse_skin": "SparseSkin SparseSkin.load SparseSkin.save",
+    "geometry.meshes": "SurfacePoints SurfacePoints.positions",
+    "evaluate.metrics": "psnr",
     "evaluate.run": "EvaluateOptions evaluate_run",
     "export.run": "ExportOptions export_avatar",
     "export.rigged": "skinned_mesh mirrored",
     "export.gltf": "Clip SkinnedMesh glb_bytes",
     "view.server": "ViewOptions view",
+    "retouch": "EditOptions save_edited paint_from",
     "doctor": "Finding examine",
     "cli": "main",
 }
@@ -86,6 +99,22 @@ def test_these_names_are_promised(module: str) -> None:
     tree = TREES[f"handavatar.{module}"]
     missing = [n for n in AT_LEAST[module].split() if find_definition(tree, n) is None]
     assert not missing
+
+
+def test_the_examples_use_promised_names_alone() -> None:
+    promised = {
+        f"handavatar.{module}.{name}"
+        for table in (EXACTLY, AT_LEAST)
+        for module, names in table.items()
+        for name in names.split()
+    }
+    paths = sorted((TOP / "examples").glob("*.py"))
+    assert len(paths) == 4
+    for path in paths:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                own = {name for name in imported_modules(node) if name.startswith("handavatar")}
+                assert own <= promised, f"{path.name}: {own - promised}"
 
 
 def test_the_package_says_its_version() -> None:
