@@ -1,4 +1,4 @@
-"""Held-out frames of two evaluated runs of one capture, side by side: the best, middle and worst.
+"""Held-out frames that two runs of one capture were both judged on: the best, middle and worst.
 
     python scripts/side_by_side.py RUN_A RUN_B --out docs/images/real_video.png
 
@@ -24,7 +24,8 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=200, help="pixels along a side of one picture")
     options = parser.parse_args()
     scores = [frame_scores(run / "evaluation") for run in options.runs]
-    names = sorted(scores[1], key=lambda name: -scores[1][name])
+    both = scores[0].keys() & scores[1].keys()
+    names = sorted(both, key=lambda name: -scores[1][name])
     chosen = [names[place] for place in np.linspace(0, len(names) - 1, COUNT).round().astype(int)]
     rows = []
     for name in chosen:
