@@ -33,6 +33,7 @@ from handavatar.export.gltf import glb_bytes
 from handavatar.export.rigged import mirrored, skinned_mesh
 from handavatar.hand.pose_sampling import sample_poses
 
+pytestmark = pytest.mark.slow
 NODE_MODULES = Path(os.environ.get("HANDAVATAR_NODE_MODULES") or "no-node-modules")
 SKIN = (0.8, 0.5, 0.4)
 """Painted all over: a colour that tells sRGB from linear."""
