@@ -397,7 +397,7 @@ def test_the_command_serves_tries_the_next_port_and_ends(
             connection.request("GET", "/about")
             assert "my wave" in json.loads(connection.getresponse().read())["motions"]
             process.send_signal(signal.SIGINT)
-            _, errors = process.communicate(timeout=30)
+            _, errors = process.communicate(timeout=180)
         finally:
             process.kill()
         assert process.returncode == 0
