@@ -8,10 +8,12 @@ import errno
 import json
 import os
 import select
+import signal
 import socket
 import socketserver
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -50,6 +52,7 @@ MOST_WAITING = 64
 MOST_PORTS = 20
 """Ports that are tried, from the one that is asked for."""
 _TIMEOUT = 20.0
+_STOPPING = (signal.SIGINT, signal.SIGTERM)
 _PAGE = {
     "/": ("index.html", "text/html; charset=utf-8"),
     "/page.js": ("page.js", "text/javascript; charset=utf-8"),
@@ -165,7 +168,7 @@ def serving(server: ViewServer) -> Iterator[ViewServer]:
 
 
 def view(options: ViewOptions) -> None:
-    """Serves until it is interrupted.
+    """Serves until SIGINT or SIGTERM; for the main thread.
 
     Raises:
         CheckpointError: if the avatar cannot be read.
@@ -197,13 +200,17 @@ def view(options: ViewOptions) -> None:
             f"{user}@{socket.gethostname()}, then open it there",
             flush=True,
         )
-    print("Ctrl-C ends it", flush=True)
+    is_stopped: list[int] = []
+    before = [signal.signal(kind, lambda *_: is_stopped.append(1)) for kind in _STOPPING]
     try:
-        server.serve()
-    except KeyboardInterrupt:
-        pass
+        with serving(server):
+            print("Ctrl-C ends it", flush=True)
+            # An exception out of a signal can be lost wherever Python swallows exceptions.
+            while not is_stopped:
+                time.sleep(0.1)
     finally:
-        server.release()
+        for kind, handler in zip(_STOPPING, before, strict=True):
+            signal.signal(kind, handler)
 
 
 @dataclass(frozen=True)
