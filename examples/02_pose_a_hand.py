@@ -65,8 +65,12 @@ for rotations in fingers.values():
     poses.append(HandPose(rotations, start.translation))
 
 # %% Cameras
-# One that holds the hand in all the poses, and the same one carried around the hand.
+# One that holds the hand in all the poses, and the same one carried around the hand. From the side
+# a hand may reach farther than from the front: the view leaves room all around.
+room = options.size / 8
 front = camera_on(avatar, poses, options.size)
+front = front.cropped(-room, -room, options.size + 2 * room, options.size + 2 * room)
+front = front.resized(options.size, options.size)
 middle = middle_of_hand(rig, start)
 cameras = [orbited(front, middle, math.radians(turn)) for turn in (-50, 0, 50)]
 

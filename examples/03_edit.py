@@ -62,7 +62,9 @@ edits = {
 }
 
 # %% Before and after
-# A thumb before the palm, so that there is a shadow to lift.
+# A thumb before the palm, so that there is a shadow to lift. An avatar of method "quick" guesses
+# its shadows from what the view ray passes: what is left without them may even be darker. "best"
+# traces light to the hand instead.
 start = start_of(avatar.info.get("view"))
 rotations = gesture(avatar.base_rig, "four")
 rotations[0] = start.rotations[0]

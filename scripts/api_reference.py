@@ -208,7 +208,7 @@ def _joined(text: str) -> str:
 
 
 def _short(value: str) -> str:
-    return value if len(value) <= _LONGEST_VALUE else "..."
+    return "..." if len(value) > _LONGEST_VALUE or value.startswith("field(") else value
 
 
 def _assigned(node: ast.stmt) -> str:

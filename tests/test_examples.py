@@ -36,7 +36,7 @@ def _run(program: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
         env=os.environ | here,
         text=True,
         capture_output=True,
-        timeout=600,
+        timeout=1800,  # Seconds are enough, unless the machine is busy with other things.
     )
 
 
@@ -59,11 +59,10 @@ def _tiles(path: Path, size: int) -> np.ndarray:
 
 
 def _assert_shows_a_hand(tile: np.ndarray) -> None:
-    """A part of the picture is lit; the border is nearly all black."""
+    """A part of the picture is lit, and the hand is whole: the border is black."""
     is_lit = tile.max(-1) > 25
-    assert 0.05 < is_lit.mean() < 0.7
-    border = np.concatenate([is_lit[0], is_lit[-1], is_lit[:, 0], is_lit[:, -1]])
-    assert border.mean() < 0.3
+    assert 0.03 < is_lit.mean() < 0.7
+    assert not np.concatenate([is_lit[0], is_lit[-1], is_lit[:, 0], is_lit[:, -1]]).any()
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +154,8 @@ def test_files_for_other_programs_are_whole(saved: Path, tmp_path: Path) -> None
     assert tuple(joints) == BONE_NAMES
     # Joints lie in the flesh of the same fist, the wrist's in the plane of its rim.
     places = np.array([joints[name] for name in BONE_NAMES[1:]])
-    assert mesh.bounds[0].max() < 1 and (places > mesh.bounds[0]).all()
+    assert 0.08 < np.ptp(mesh.bounds, axis=0).max() < 0.15  # Metres.
+    assert (places > mesh.bounds[0]).all()
     assert (places < mesh.bounds[1]).all()
     reach = np.linalg.norm(mesh.vertices - joints["wrist"], axis=1).max()
     assert f"reaches {100 * reach:.1f} cm" in told
