@@ -17,7 +17,6 @@ from handavatar.avatar import HandAvatar
 from handavatar.capture.motion import gesture
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit, Paint, bones_named
-from handavatar.geometry.meshes import SurfacePoints
 from handavatar.hand.pose import FINGER_BONES, HandPose
 
 
@@ -48,8 +47,7 @@ avatar = HandAvatar.load(options.avatar)
 # Paint is a colour and an opacity for each anchor, a point fixed on the skin. Here every anchor of
 # the index finger: whatever is known of the mesh's vertices, such as which bone moves them, is
 # known of the anchors too. A picture in the texture chart is another way: retouch.paint_from.
-anchors = SurfacePoints(avatar.anchor_corners, avatar.anchor_barycentric)
-shares = anchors.positions(avatar.rig.skin_weights)
+shares = avatar.anchors.positions(avatar.rig.skin_weights)
 opacity = shares[:, list(FINGER_BONES["index"])].sum(-1).gt(0.5).float()
 green = torch.tensor([0.1, 0.55, 0.25]).expand(len(opacity), 3)
 

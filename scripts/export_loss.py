@@ -23,9 +23,7 @@ from handavatar.capture.motion import named_motion
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
 from handavatar.export.baking import baked_textures
-from handavatar.export.chart import charted
-from handavatar.export.surface import average_hand
-from handavatar.hand.rig import ShapedHand
+from handavatar.export.surface import textured_hand
 from handavatar.render.rasterize import rasterize
 
 TEXELS = 1024
@@ -34,9 +32,8 @@ POSES = 6
 
 def measure(path: Path, size: int) -> dict[str, float]:
     avatar = HandAvatar.load(path)
-    hand = average_hand(avatar)
-    rig = charted(avatar.base_rig, hand.rig, avatar.rounds)
-    hand = ShapedHand(rig, hand.rest_vertices, hand.rest_joints)
+    hand = textured_hand(avatar)
+    rig = hand.rig
     textures = {
         "albedo_psnr": baked_textures(avatar, hand, Edit(), TEXELS, has_occlusion=False),
         "unlit_psnr": baked_textures(avatar, hand, Edit(), TEXELS, has_light_baked=True),

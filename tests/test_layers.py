@@ -29,7 +29,7 @@ MAY_IMPORT = {
         # Prior art, for a table alone.
         "peers": "geometry hand capture field render avatar evaluate train",
         # A texture's chart is rasterised; words of an edit mean what they mean elsewhere.
-        "export": "geometry hand capture field render edit avatar retouch",
+        "export": "geometry hand capture field render edit avatar retouch unfinished",
         # Its fluid pictures bake the fields on the mesh; its others are what `animate` makes.
         "view": "geometry hand capture field render edit avatar animate",
         # What words and pictures mean to an avatar.

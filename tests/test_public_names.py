@@ -69,7 +69,7 @@ AT_LEAST = {
     "export.rigged": "skinned_mesh mirrored",
     "export.gltf": "Clip SkinnedMesh glb_bytes",
     "view.server": "ViewOptions view",
-    "retouch": "EditOptions save_edited paint_from",
+    "retouch": "Look EditOptions save_edited paint_from",
     "doctor": "Finding examine",
     "cli": "main",
 }

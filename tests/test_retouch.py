@@ -30,10 +30,10 @@ def stripes(tmp_path: Path) -> Path:
 
 
 def test_flags_become_an_edit(small_avatar: HandAvatar) -> None:
-    assert Look().on(small_avatar) == Edit()
-    assert Look(1.5, "0.1, -0.2,0", "thumb, index1").on(small_avatar) == Edit(
-        1.5, (0.1, -0.2, 0.0), (13, 14, 15, 1)
-    )
+    assert Look().edit_on(small_avatar) == Edit()
+    assert Look(light_gain=1.5, albedo_shift="0.1, -0.2,0", lift_shadow="thumb, index1").edit_on(
+        small_avatar
+    ) == Edit(1.5, (0.1, -0.2, 0.0), (13, 14, 15, 1))
 
 
 def test_anchors_lie_in_the_chart_where_their_face_does(small_avatar: HandAvatar) -> None:
@@ -76,7 +76,9 @@ def test_an_edit_is_saved_into_an_avatar_and_the_next_comes_on_top(
             paint=stripes,
         )
     )
-    look = Look(1.5, "0.1,0,-0.1", "thumb", stripes).on(small_avatar)
+    look = Look(
+        light_gain=1.5, albedo_shift="0.1,0,-0.1", lift_shadow="thumb", paint=stripes
+    ).edit_on(small_avatar)
     edited = HandAvatar.load(saved)
     expected = _seen(small_avatar, look)
     for name, value in vars(_seen(edited)).items():
@@ -110,4 +112,4 @@ def test_a_picture_that_is_no_paint_is_refused(small_avatar: HandAvatar, tmp_pat
 )
 def test_words_that_mean_nothing_are_refused(look: Look, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        look.check()
+        look.check_look()

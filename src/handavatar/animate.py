@@ -26,6 +26,7 @@ from handavatar.capture.view import start_of
 from handavatar.edit import Edit
 from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.geometry.cameras import Camera, look_at, project
+from handavatar.geometry.colors import eight_bits
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
 from handavatar.processes import joined_processes
@@ -36,7 +37,7 @@ PASSES = ("rgb", "albedo", "illumination", "normal", "depth", "alpha")
 
 
 @dataclass(frozen=True)
-class RenderOptions:
+class RenderOptions(Look):
     """What to render.
 
     Attributes:
@@ -53,10 +54,6 @@ class RenderOptions:
             weighs 1e-7, and takes some three times as long.
         check: of every frame so many pixels are evaluated exactly as well, and ``errors.json``
             states how far they are from the picture.
-        light_gain: multiplies the illumination.
-        albedo_shift: added to the albedo, R,G,B in [-1, 1].
-        lift_shadow: fingers or bones that cast no shadow, comma-separated.
-        paint: a picture with transparency (PNG) in the rig's texture chart, laid on the skin.
         overwrite: replace what lies at ``out``.
         device: where the fields run.
         kernel: what decodes pairs of parts; ``triton`` is for NVIDIA GPUs, with ``-tf32`` or
@@ -73,10 +70,6 @@ class RenderOptions:
     num_samples: int = 64
     quality: Literal["near-exact", "exact"] = "near-exact"
     check: int = 0
-    light_gain: float = 1.0
-    albedo_shift: str = "0,0,0"
-    lift_shadow: str = ""
-    paint: Path | None = None
     overwrite: bool = False
     device: str = "auto"
     kernel: Kernel = "torch"
@@ -111,12 +104,11 @@ def render_motion(options: RenderOptions) -> Path:
             raise ValueError(
                 f"--passes: there is no pass '{name}'; choose from {', '.join(PASSES)}"
             )
-    look = Look(options.light_gain, options.albedo_shift, options.lift_shadow, options.paint)
-    look.check()
+    options.check_look()
     device = str(chosen_device(options.device))
     kernel = chosen_kernel(options.kernel, device)
     avatar = HandAvatar.load(options.run)
-    edit = look.on(avatar)
+    edit = options.edit_on(avatar)
     start = start_of(avatar.info.get("view"))
     motion = open_motion(options.motion, avatar.base_rig.to("cpu"), start)
     poses = [motion.pose(step) for step in _spread(len(motion), options.frames)]
@@ -309,10 +301,7 @@ def pass_pictures(rendering: Rendering, side: str = "right") -> dict[str, np.nda
         "depth": (closeness * alpha)[..., None].expand(-1, -1, 3),
         "alpha": alpha[..., None].expand(-1, -1, 3),
     }
-    pictures = {
-        name: (value.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-        for name, value in values.items()
-    }
+    pictures = {name: eight_bits(value).numpy() for name, value in values.items()}
     if side == "left":
         pictures = {name: np.ascontiguousarray(value[:, ::-1]) for name, value in pictures.items()}
     return pictures

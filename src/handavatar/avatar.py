@@ -262,6 +262,11 @@ class HandAvatar(nn.Module):
         """Where the weights are."""
         return self.coefficients.device
 
+    @property
+    def anchors(self) -> SurfacePoints:
+        """The anchors as points on the rig's faces, which any values at vertices reach."""
+        return SurfacePoints(self.anchor_corners, self.anchor_barycentric)
+
     def moved_to(self, device: torch.device | str) -> "HandAvatar":
         """Moves weights, rig, parts and paint; returns itself."""
         self.to(device)
@@ -307,10 +312,9 @@ class HandAvatar(nn.Module):
         rest = self.rig.shaped(self.coefficients)
         offsets = self.shape(rest, pose.rotations)
         posed = personal_hand(rest, offsets).posed(pose)
-        anchors = SurfacePoints(self.anchor_corners, self.anchor_barycentric)
-        normals = anchors.positions(vertex_normals(posed.vertices, self.rig.faces))
+        normals = self.anchors.positions(vertex_normals(posed.vertices, self.rig.faces))
         normals = torch.nn.functional.normalize(normals, dim=-1)
-        places = anchors.positions(posed.vertices)
+        places = self.anchors.positions(posed.vertices)
         return HandState(
             posed,
             offsets,

@@ -15,9 +15,9 @@ from handavatar.edit import Edit, Paint, bones_named
 from handavatar.hand.rig import Rig
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Look:
-    """An edit as the command line has it.
+    """An edit as the command line has it; the options of every command that edits have these.
 
     Attributes:
         light_gain: multiplies the illumination.
@@ -31,7 +31,7 @@ class Look:
     lift_shadow: str = ""
     paint: Path | None = None
 
-    def check(self) -> None:
+    def check_look(self) -> None:
         """Refuses words that mean nothing, before anything is read.
 
         Raises:
@@ -40,7 +40,7 @@ class Look:
         self._shift()
         self._bones()
 
-    def on(self, avatar: HandAvatar) -> Edit:
+    def edit_on(self, avatar: HandAvatar) -> Edit:
         """The edit of this avatar.
 
         Raises:
@@ -70,25 +70,17 @@ class Look:
 
 
 @dataclass(frozen=True)
-class EditOptions:
+class EditOptions(Look):
     """Saves an edit into an avatar: everything that renders it shows it.
 
     Attributes:
         run: run folder, or an avatar file; it stays as it is.
         out: the new avatar file.
-        light_gain: multiplies the illumination.
-        albedo_shift: added to the albedo, R,G,B in [-1, 1].
-        lift_shadow: fingers or bones that cast no shadow, comma-separated.
-        paint: a picture with transparency (PNG) in the rig's texture chart, laid on the skin.
         overwrite: replace what lies at ``out``.
     """
 
     run: Path
     out: Path
-    light_gain: float = 1.0
-    albedo_shift: str = "0,0,0"
-    lift_shadow: str = ""
-    paint: Path | None = None
     overwrite: bool = False
 
 
@@ -100,12 +92,11 @@ def save_edited(options: EditOptions) -> Path:
         CaptureError: if the picture of the paint cannot be read, or the file is there already.
         ValueError: what cannot be understood.
     """
-    look = Look(options.light_gain, options.albedo_shift, options.lift_shadow, options.paint)
-    look.check()
+    options.check_look()
     if options.out.exists() and not (options.overwrite and options.out.is_file()):
         raise CaptureError(f"{options.out} exists", "name another file, or use --overwrite")
     avatar = HandAvatar.load(options.run)
-    avatar.edit = avatar.edit.then(look.on(avatar))
+    avatar.edit = avatar.edit.then(options.edit_on(avatar))
     avatar.save(options.out)
     return options.out
 

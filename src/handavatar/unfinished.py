@@ -1,4 +1,4 @@
-"""A folder of frames that is filled aside, by one process or several, and renamed when it is whole.
+"""Files and folders of frames that are filled aside, and renamed when they are whole.
 
 What a killed process has finished stays, and the same command given again does only the rest.
 """
@@ -6,11 +6,26 @@ What a killed process has finished stays, and the same command given again does 
 import json
 import os
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 _RECORD = "unfinished.json"
+
+
+def write_whole(files: Mapping[Path, bytes]) -> None:
+    """Writes all files aside and then renames them: nothing half written is ever at its place."""
+    pending: dict[Path, Path] = {}
+    try:
+        for path, content in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            pending[path] = path.with_name(f".tmp-{os.getpid()}-{path.name}")
+            pending[path].write_bytes(content)
+        for path, aside in pending.items():
+            os.replace(aside, path)
+    finally:
+        for aside in pending.values():
+            aside.unlink(missing_ok=True)
 
 
 class UnfinishedFolder:
@@ -52,14 +67,7 @@ class UnfinishedFolder:
 
     def write(self, name: str, content: bytes) -> None:
         """Writes one file aside and renames it into place."""
-        path = self.path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside = path.with_name(f".tmp-{os.getpid()}-{path.name}")
-        try:
-            aside.write_bytes(content)
-            os.replace(aside, path)
-        finally:
-            aside.unlink(missing_ok=True)
+        write_whole({self.path / name: content})
 
     def finish(self) -> None:
         """Takes the target's place; one process alone, when all is there."""

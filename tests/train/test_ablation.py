@@ -4,6 +4,7 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from handavatar.train import ablation
 from handavatar.train.ablation import (
     ROWS,
     FittedGeometry,
+    Row,
+    Shading,
     SplitShading,
     fitted_geometry,
     judged,
@@ -175,10 +178,20 @@ def test_some_rows_of_a_capture_without_truth_and_then_more(
     assert row["against"] is None and float(str(row["psnr"])) > 5
     both = replace(options, rows=("(paper)", "traced light"))
     done: list[int] = []
+    train, trainings = ablation.trained_shading, []
+
+    def counted(row: Row, *rest: Any) -> Shading:
+        trainings.append(row)
+        return train(row, *rest)
+
+    monkeypatch.setattr(ablation, "trained_shading", counted)
     table = ablation_table(both, done.append)
     assert len(done) == both.total_steps == 3
     assert table.rows["+ directed occupancy (paper)"] == row
     assert table.rows["traced light"]["gain, all"] is not None
+    # Poses are known: with corrected ones it is the same training, which is not done again.
+    assert table.rows["traced light, poses corrected (best)"] == table.rows["traced light"]
+    assert trainings == [ROWS["traced light"]]
     assert ablation_table(replace(options, rows=("(paper)",))) == first
     with pytest.raises(ValueError, match="--rows sunlight: no row"):
         ablation_table(replace(options, rows=("sunlight",)))

@@ -54,7 +54,7 @@ from handavatar.capture.pathtracer import (
 )
 from handavatar.capture.skin import SkinOptions, paint_skin, smooth_noise
 from handavatar.geometry.cameras import Camera, look_at, project
-from handavatar.geometry.colors import srgb_from_linear
+from handavatar.geometry.colors import eight_bits, srgb_from_linear
 from handavatar.geometry.meshes import uniform_laplacian, unique_edges, vertex_normals
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.detail import subdivided
@@ -389,8 +389,8 @@ def _frames(
             color = traced.color + (1 - traced.alpha[..., None]) * _BACKGROUND**2.2
             frame = Frame(
                 name=f"{index:06d}",
-                image=_eight_bits(srgb_from_linear(color)),
-                coverage=_eight_bits(traced.alpha),
+                image=eight_bits(srgb_from_linear(color)),
+                coverage=eight_bits(traced.alpha),
                 camera=camera,
                 pose=motion.pose(step),
                 confidence=1.0,
@@ -498,16 +498,12 @@ def _write_truth(
     def save(kind: str, pixels: np.ndarray) -> None:
         Image.fromarray(pixels).save(writer.file(f"truth/{kind}/{frame.name}.png"))
 
-    save("albedo", _eight_bits(albedo).numpy())
-    save("shading", _eight_bits(shading).numpy())
+    save("albedo", eight_bits(albedo).numpy())
+    save("shading", eight_bits(shading).numpy())
     if geometry:
         tenths = (maps.depth * 1e4 * mask).round().clamp(0, 65535)
         save("depth", tenths.numpy().astype(np.uint16))
-        save("normals", _eight_bits((maps.normals + 1) / 2 * mask[..., None]).numpy())
-
-
-def _eight_bits(values: Tensor) -> Tensor:
-    return (values.clamp(0, 1) * 255).round().to(torch.uint8)
+        save("normals", eight_bits((maps.normals + 1) / 2 * mask[..., None]).numpy())
 
 
 def contact_sheet(pictures: list[Tensor], columns: int = 8, cell: int = 160) -> Tensor:

@@ -1,6 +1,5 @@
 """``handavatar bench``: the paper's tables, measured here."""
 
-import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -79,6 +78,7 @@ def bench(words: list[str]) -> int:
     """Measure a table: ``bench --table ablation|geometry|lift|peers|skin|speed|training``."""
     from handavatar.cli.arguments import JSON, Extra, parse_with, print_json
     from handavatar.train.progress import Progress
+    from handavatar.unfinished import write_whole
 
     name = _named_table(words)
     if name not in _TABLES:
@@ -99,7 +99,7 @@ def bench(words: list[str]) -> int:
     with Progress(f"bench {name}", options.total_steps) as progress:
         table = chosen.make(options, progress.update)
     if extras["out"] is not None:
-        _write(extras["out"], table.markdown())
+        write_whole({extras["out"]: table.markdown().encode()})
     if extras["json"]:
         print_json(table.record())
     else:
@@ -115,11 +115,3 @@ def _named_table(words: list[str]) -> str:
         if word == "--table":
             return following
     return ""
-
-
-def _write(path: Path, text: str) -> None:
-    """Aside first, then renamed into place."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(path.name + ".tmp")
-    aside.write_text(text, encoding="utf-8")
-    os.replace(aside, path)

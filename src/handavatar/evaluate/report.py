@@ -18,6 +18,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from torch import Tensor
 
+from handavatar.geometry.colors import eight_bits
+
 Metric = float | int | str | bool | None
 """A figure; ``None`` was not measured."""
 
@@ -102,7 +104,7 @@ def picture(
 ) -> UInt8[np.ndarray, "height width *channels"]:
     """Values in [0, 1] as 8-bit pixels; outside they saturate, NaN is black."""
     filled = torch.nan_to_num(values.detach().float().cpu(), nan=0.0)
-    pixels: np.ndarray = (filled.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    pixels: np.ndarray = eight_bits(filled).numpy()
     return pixels
 
 

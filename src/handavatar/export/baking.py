@@ -14,10 +14,9 @@ from handavatar.capture.motion import middle_of_hand, placed
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
 from handavatar.export.chart import Texels, texels_of
-from handavatar.export.polygons import eight_bits
 from handavatar.field.anchors import Neighbours, nearest_anchors
 from handavatar.geometry.cameras import Rays
-from handavatar.geometry.colors import linear_from_srgb
+from handavatar.geometry.colors import eight_bits, linear_from_srgb
 from handavatar.geometry.meshes import SurfacePoints
 from handavatar.geometry.rotations import invert_rigid, matrix_from_axis_angle
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
@@ -65,8 +64,7 @@ def anchors_near(
     avatar: HandAvatar, hand: ShapedHand, points: Float[Tensor, "points 3"]
 ) -> Neighbours:
     """Nearest anchors of points on a hand in its zero pose."""
-    anchors = SurfacePoints(avatar.anchor_corners, avatar.anchor_barycentric)
-    return nearest_anchors(anchors.positions(hand.rest_vertices), points)
+    return nearest_anchors(avatar.anchors.positions(hand.rest_vertices), points)
 
 
 @torch.no_grad()
@@ -209,9 +207,7 @@ def mean_light(
         return MeanLight(torch.full_like(total, gain), 1.0, gain)
     known = (times > 0).nonzero()[:, 0]
     light = total / times.clamp_min(1)
-    places = SurfacePoints(avatar.anchor_corners, avatar.anchor_barycentric).positions(
-        hand.rest_vertices
-    )
+    places = avatar.anchors.positions(hand.rest_vertices)
     count_near = min(4, len(known))
     around = nearest_anchors(places[known], places, count_near)
     guessed = around.interpolated(light[known, None])[:, 0]
@@ -231,7 +227,7 @@ def _eye(avatar: HandAvatar) -> Float[Tensor, "3"]:
 
 
 def _png(picture: Float[Tensor, "size size channels"]) -> bytes:
-    pixels = eight_bits(picture)
+    pixels = eight_bits(picture).numpy()
     buffer = io.BytesIO()
     Image.fromarray(pixels[..., 0] if pixels.shape[-1] == 1 else pixels).save(buffer, "PNG")
     return buffer.getvalue()

@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from handavatar.geometry.colors import eight_bits
+
 
 class ObjFiles(NamedTuple):
     """The two texts of an OBJ; the picture that they name is the third file."""
@@ -44,7 +46,7 @@ def ply_bytes(
     ]
     rows = np.empty(len(vertices), dtype=[("at", "<f4", 6), ("color", "u1", 3)])
     rows["at"] = torch.cat([vertices, normals], dim=-1).numpy()
-    rows["color"] = eight_bits(colors)
+    rows["color"] = eight_bits(colors).numpy()
     corners = np.empty(len(faces), dtype=[("count", "u1"), ("corners", "<i4", 3)])
     corners["count"] = 3
     corners["corners"] = faces.numpy()
@@ -80,8 +82,3 @@ def obj_bytes(
         lines.append("f " + " ".join(f"{corner}/{place}/{corner}" for corner, place in pairs))
     material = f"newmtl skin\nKa 1 1 1\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {stem}.png\n"
     return ObjFiles(("\n".join(lines) + "\n").encode(), material.encode())
-
-
-def eight_bits(colors: Float[Tensor, "*shape"]) -> np.ndarray:
-    """Values in [0, 1] as bytes."""
-    return (colors.clamp(0, 1) * 255).round().to(torch.uint8).numpy()

@@ -11,10 +11,9 @@ from handavatar.avatar import HandAvatar
 from handavatar.capture.motion import Motion
 from handavatar.edit import Edit
 from handavatar.export.baking import NUM_LIGHT_POSES, baked_textures
-from handavatar.export.chart import charted
 from handavatar.export.gltf import Clip, SkinnedMesh
 from handavatar.export.skeletons import BoneNames, Skeleton, skeleton_of
-from handavatar.export.surface import average_hand, rest_shape_error, split_at_seams
+from handavatar.export.surface import rest_shape_error, split_at_seams, textured_hand
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.geometry.rotations import apply_rigid, invert_rigid, rigid_transform
 from handavatar.hand.pose import bone_transforms
@@ -49,9 +48,8 @@ def skinned_mesh(
     """
     edit = edit or Edit()
     side = str(avatar.info.get("side", "right"))
-    hand = average_hand(avatar)
-    rig = charted(avatar.base_rig, hand.rig, avatar.rounds)
-    hand = ShapedHand(rig, hand.rest_vertices, hand.rest_joints)
+    hand = textured_hand(avatar)
+    rig = hand.rig
     textures = baked_textures(avatar, hand, edit, texture_size, is_unlit, light_poses=light_poses)
     skeleton = skeleton_of(hand, bones, side)
     seamed = split_at_seams(rig)

@@ -1,6 +1,5 @@
 """``handavatar export``: an avatar as files that other programs open."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -14,22 +13,21 @@ from handavatar.capture.motion import gesture, open_motion
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
 from handavatar.export.baking import baked_textures, colors_at_vertices
-from handavatar.export.chart import charted
 from handavatar.export.gltf import glb_bytes
 from handavatar.export.polygons import obj_bytes, ply_bytes
 from handavatar.export.rigged import MIRROR, skinned_mesh
 from handavatar.export.skeletons import BoneNames
-from handavatar.export.surface import average_hand
+from handavatar.export.surface import average_hand, textured_hand
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.hand.pose import HandPose
-from handavatar.hand.rig import ShapedHand
 from handavatar.retouch import Look
+from handavatar.unfinished import write_whole
 
 MAX_TEXTURE = 8192
 
 
 @dataclass(frozen=True)
-class ExportOptions:
+class ExportOptions(Look):
     """An avatar as files that other programs open.
 
     Attributes:
@@ -44,10 +42,6 @@ class ExportOptions:
             turn) that a GLB carries as an animation.
         pose: a gesture (flat, relaxed, fist, point, ...) that PLY and OBJ show.
         unlit: colours with the mean light baked in, and no engine's light on them.
-        light_gain: multiplies the illumination.
-        albedo_shift: added to the albedo, R,G,B in [-1, 1].
-        lift_shadow: fingers or bones that cast no shadow, comma-separated.
-        paint: a picture with transparency (PNG) in the rig's texture chart, laid on the skin.
         overwrite: replace what lies at ``out``.
     """
 
@@ -59,10 +53,6 @@ class ExportOptions:
     motion: str | None = None
     pose: str = "flat"
     unlit: bool = False
-    light_gain: float = 1.0
-    albedo_shift: str = "0,0,0"
-    lift_shadow: str = ""
-    paint: Path | None = None
     overwrite: bool = False
 
 
@@ -77,21 +67,20 @@ def export_avatar(options: ExportOptions) -> Path:
         CaptureError: if the motion or the paint cannot be read, or there is no such gesture.
         ValueError: for options that contradict each other, or a file that is there already.
     """
-    look = Look(options.light_gain, options.albedo_shift, options.lift_shadow, options.paint)
-    look.check()
+    options.check_look()
     _check(options)
     avatar = HandAvatar.load(options.run)
     weights = [value for value in avatar.state_dict().values() if value.is_floating_point()]
     if not all(bool(torch.isfinite(value).all()) for value in weights):
         raise CheckpointError(f"{options.run}: holds NaN or infinity; train the avatar again")
-    edit = look.on(avatar)
+    edit = options.edit_on(avatar)
     if options.format == "glb":
         contents = [_glb(avatar, edit, options)]
     elif options.format == "ply":
         contents = [_ply(avatar, edit, options)]
     else:
         contents = _obj(avatar, edit, options)
-    _write(dict(zip(_files(options), contents, strict=True)))
+    write_whole(dict(zip(_files(options), contents, strict=True)))
     return options.out
 
 
@@ -148,27 +137,10 @@ def _ply(avatar: HandAvatar, edit: Edit, options: ExportOptions) -> bytes:
 
 
 def _obj(avatar: HandAvatar, edit: Edit, options: ExportOptions) -> list[bytes]:
-    hand = average_hand(avatar)
-    rig = charted(avatar.base_rig, hand.rig, avatar.rounds)
-    hand = ShapedHand(rig, hand.rest_vertices, hand.rest_joints)
+    hand = textured_hand(avatar)
+    rig = hand.rig
     vertices, normals, faces = _surface(avatar, options)
     places = rig.uv_faces.flip(-1) if avatar.info.get("side") == "left" else rig.uv_faces
     texts = obj_bytes(vertices, normals, rig.uv_coordinates, faces, places, options.out.stem)
     textures = baked_textures(avatar, hand, edit, options.texture_size, options.unlit, False)
     return [textures.base_color, texts.material, texts.mesh]
-
-
-def _write(files: dict[Path, bytes]) -> None:
-    """All aside first, then renamed: nothing half written is ever at its place."""
-    pending: dict[Path, Path] = {}
-    try:
-        for path, content in files.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            aside = path.with_name(f".tmp-{os.getpid()}-{path.name}")
-            pending[path] = aside
-            aside.write_bytes(content)
-        for path, aside in pending.items():
-            os.replace(aside, path)
-    finally:
-        for aside in pending.values():
-            aside.unlink(missing_ok=True)

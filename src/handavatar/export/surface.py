@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar
+from handavatar.export.chart import charted
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import sample_poses
 from handavatar.hand.rig import Rig, ShapedHand
@@ -42,6 +43,16 @@ def average_hand(avatar: HandAvatar, count: int = NUM_SHAPE_POSES) -> ShapedHand
         pose_directions=vertices.new_zeros(len(vertices), 3, 0),
     )
     return ShapedHand(rig, vertices, joints)
+
+
+def textured_hand(avatar: HandAvatar) -> ShapedHand:
+    """:func:`average_hand` with a chart that can carry a texture.
+
+    Args:
+        avatar: on the CPU.
+    """
+    hand = average_hand(avatar)
+    return replace(hand, rig=charted(avatar.base_rig, hand.rig, avatar.rounds))
 
 
 @torch.no_grad()

@@ -18,7 +18,6 @@ from handavatar.field.anchors import nearest_anchors
 from handavatar.field.layers import MLP, positional_encoding
 from handavatar.field.shading import POSITION_SCALE
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
-from handavatar.geometry.meshes import SurfacePoints
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, ShapedHand
 from handavatar.peers.descent import descend
@@ -124,12 +123,11 @@ def ray_samples(avatar: HandAvatar, frame: Frame, stride: int = 1) -> RaySamples
     middles = (torch.arange(NUM_SAMPLES) + 0.5) / NUM_SAMPLES * (last - first) + first
     depths = lean[:, None] * middles
     points = rays.origins[:, None] + depths[..., None] * rays.directions[:, None]
-    anchors = SurfacePoints(avatar.anchor_corners, avatar.anchor_barycentric)
-    places = anchors.positions(posed.vertices)
+    places = avatar.anchors.positions(posed.vertices)
     neighbours = nearest_anchors(places, points.flatten(0, 1))
     nearest = (points.flatten(0, 1) - places[neighbours.indices[:, 0]]).norm(dim=-1)
     kept = (nearest < REACH).nonzero()[:, 0]
-    weights = anchors.positions(avatar.rig.skin_weights)
+    weights = avatar.anchors.positions(avatar.rig.skin_weights)
     of_kept = neighbours.interpolated(weights)[kept]
     return RaySamples(
         pixels,

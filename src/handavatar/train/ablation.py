@@ -48,7 +48,7 @@ from handavatar.field.shading import (
     TracedCues,
 )
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
-from handavatar.geometry.meshes import SurfacePoints
+from handavatar.geometry.colors import eight_bits
 from handavatar.hand.rig import ShapedHand
 from handavatar.render.volume import composite_sparse
 from handavatar.train.appearance import (
@@ -203,6 +203,7 @@ def _split(cues: CueSet) -> Callable[[Tensor, Tensor], Shading]:
     return lambda anchors, color: SplitShading(anchors, cues, color)
 
 
+_TRACED = _split(TracedCues())
 ROWS: dict[str, Row] = {
     "coefficients, entangled": Row("coefficients", EntangledShading, ""),
     "+ personal shape": Row("personal", EntangledShading, "coefficients, entangled"),
@@ -221,9 +222,9 @@ ROWS: dict[str, Row] = {
     "normals, poses corrected (quick)": Row(
         "corrected", _split(OrientedCues()), "+ directed occupancy (paper)"
     ),
-    "traced light": Row("personal", _split(TracedCues()), "+ directed occupancy (paper)"),
+    "traced light": Row("personal", _TRACED, "+ directed occupancy (paper)"),
     "traced light, poses corrected (best)": Row(
-        "corrected", _split(TracedCues()), "+ directed occupancy (paper)"
+        "corrected", _TRACED, "+ directed occupancy (paper)"
     ),
 }
 """Each names the part that it adds to the row it is compared with."""
@@ -307,12 +308,11 @@ def fitted_geometry(capture: Capture, shape: Shape, method: Method, seed: int) -
     seen = place_directions(avatar, frames, seen, seed)
     tests = [_aligned(avatar, capture.frame(index)) for index in capture.split("test")]
     views = [view_of_frame(avatar, frame, frame.camera, settings) for frame in tests]
-    anchors = SurfacePoints(avatar.anchor_corners, avatar.anchor_barycentric)
     chosen = torch.linspace(0, len(tests) - 1, _TURNED_POSES).round().long().tolist()
     return FittedGeometry(
         avatar,
         frames,
-        anchors.positions(avatar.rig.template_vertices),
+        avatar.anchors.positions(avatar.rig.template_vertices),
         seen,
         views,
         [_turned(avatar, tests[number], replace(settings, num_samples=256)) for number in chosen],
@@ -611,7 +611,8 @@ def ablate(
     begin = time.perf_counter()
     hidden: list[float] = []
     shown: list[int] = []
-    columns: list[Float[Tensor, "height width 3"]] = []
+    columns: dict[str, Float[Tensor, "height width 3"]] = {}
+    trained: dict[tuple[Shape, Callable[[Tensor, Tensor], Shading]], str] = {}
     for name in names:
         row = ROWS[name]
         # Where poses are exact there is nothing to correct.
@@ -625,19 +626,27 @@ def ablate(
         if not columns:
             order = sorted(range(len(hidden)), key=lambda place: hidden[place])
             shown = [order[0], order[len(order) // 2], order[-1]]
-            columns.append(_true_column(capture, [known[shape].views[n].frame for n in shown]))
+            frames = [known[shape].views[n].frame for n in shown]
+            columns["truth"] = _true_column(capture, frames)
+        # Where nothing is corrected, two rows are the same trainings.
+        same = trained.setdefault((shape, row.make), name)
+        if same != name:
+            rows[name], columns[name] = rows[same], columns[same]
+            for _ in seeds:
+                finished()
+            continue
         rows[name] = {}
         for seed in seeds:
             shading = trained_shading(row, known[shape], method, steps, seed)
-            frames, whole = judged(shading, known[shape], capture)
-            rows[name][str(seed)] = {"frames": frames, "whole": whole}
+            scores, whole = judged(shading, known[shape], capture)
+            rows[name][str(seed)] = {"frames": scores, "whole": whole}
             if seed == seeds[0]:
-                columns.append(_column(shading, [known[shape].views[n] for n in shown]))
+                columns[name] = _column(shading, [known[shape].views[n] for n in shown])
             finished()
     if pictures is not None:
         pictures.parent.mkdir(parents=True, exist_ok=True)
-        sheet = torch.cat(columns, dim=1).clamp(0, 1)
-        Image.fromarray((sheet * 255).round().byte().numpy()).save(pictures)
+        sheet = torch.cat(list(columns.values()), dim=1)
+        Image.fromarray(eight_bits(sheet).numpy()).save(pictures)
     return {
         "capture": folder.name,
         "steps": steps,

@@ -13,6 +13,7 @@ from torch import Tensor
 from handavatar.evaluate.geometry import Skin, Truth
 from handavatar.field.decoders import OccupancyField
 from handavatar.geometry.cameras import framing_camera
+from handavatar.geometry.colors import eight_bits
 from handavatar.geometry.extraction import Field
 from handavatar.hand.open_hand import Level
 from handavatar.hand.parts import POINT_ROUNDS, finer_rig
@@ -120,7 +121,7 @@ def side_by_side(
     rows = []
     for title, (vertices, faces) in meshes.items():
         pictures = [shaded_mesh(vertices, faces, camera) for camera in cameras.values()]
-        strip = (torch.cat(pictures, dim=1) * 255).round().to(torch.uint8).numpy()
+        strip = eight_bits(torch.cat(pictures, dim=1)).numpy()
         head = Image.new("RGB", (strip.shape[1], _TITLE), (255, 255, 255))
         draw = ImageDraw.Draw(head)
         for column, side in enumerate(cameras):

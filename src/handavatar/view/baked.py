@@ -66,7 +66,7 @@ class BakedAvatar:
         """
         self._avatar = avatar
         self._first = first.to(avatar.device)
-        self._anchors = SurfacePoints(avatar.anchor_corners, avatar.anchor_barycentric)
+        self._anchors = avatar.anchors
         template = avatar.rig.template_vertices
         places = self._anchors.positions(template)
         every = max(len(places) // NUM_LIT, 1)

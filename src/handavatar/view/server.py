@@ -139,16 +139,12 @@ class ViewServer:
         return f"http://{host}:{self.port}/{query}"
 
     def serve(self) -> None:
-        """Answers until :meth:`close` is called from another thread, or interrupted."""
+        """Answers until :meth:`close` is called from another thread."""
         self._http.serve_forever(poll_interval=0.2)
 
     def close(self) -> None:
         """Stops answering, drops what is being made, frees the port."""
         self._http.shutdown()
-        self.release()
-
-    def release(self) -> None:
-        """As :meth:`close`, where nothing is answered any more."""
         self._http.server_close()
         self._http.hang_up()
         self.films.close()

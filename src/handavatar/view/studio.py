@@ -31,6 +31,7 @@ from handavatar.capture.motion import (
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit, Paint
 from handavatar.geometry.cameras import Camera
+from handavatar.geometry.colors import eight_bits
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import BONE_NAMES, FINGER_BONES, HandPose
 from handavatar.hand.pose_sampling import (
@@ -345,7 +346,7 @@ class Studio:
             shown = shaded_mesh(
                 vertices, self._avatar.rig.faces, camera.to(vertices.device), samples
             )
-        pixels = (shown.cpu() * 255).round().to(torch.uint8).numpy()
+        pixels = eight_bits(shown.cpu()).numpy()
         return np.ascontiguousarray(pixels[:, ::-1]) if self.side == "left" else pixels
 
     def _degrees(self, rotations: Float[Tensor, "bones 3"]) -> list[list[float]]:
