@@ -104,7 +104,7 @@ class RenderSettings:
             off the mesh; infinity looks at all pixels.
         edge_rays: at the hand's outline a pixel is the mean of so many rays in both directions; a
             single one says all or nothing of a pixel that the hand covers in part.
-        rays_at_once: bounds the memory.
+        rays_at_once: bounds the memory; a GPU takes 32 times as many.
         kernel: what decodes pairs of parts; see :func:`handavatar.field.kernels.chosen_kernel`.
             With shorter factors, samples that can be seen are evaluated once more with 32 bits.
     """
@@ -415,7 +415,7 @@ class HandAvatar(nn.Module):
         ray, sample = kept.unbind(-1)
         along = depths[ray, sample]
         points = rays_hit.origins[ray] + along[:, None] * rays_hit.directions[ray]
-        neighbours = nearest_anchors(state.anchors, points)
+        neighbours = nearest_anchors(state.anchors, points, kernel=settings.kernel)
         return VisibleSamples(weights, hit[ray], along, directed, neighbours)
 
     def alpha(
@@ -452,7 +452,8 @@ class HandAvatar(nn.Module):
             used = PairItems(item_position[is_used], items.pairs[is_used], items.is_wanted[is_used])
             ray, sample = kept.unbind(-1)
             points = rays.origins[ray] + depths[ray, sample][:, None] * rays.directions[ray]
-            again = self.occupancy.of_items(codes, points, used)
+            kernel: Kernel = "torch" if torch.is_grad_enabled() else settings.kernel
+            again = self.occupancy.of_items(codes, points, used, kernel)
             occupancy = occupancy.index_put((ray, sample), again)
         return visibility(occupancy)[is_kept], kept, directed
 
@@ -604,8 +605,9 @@ class HandAvatar(nn.Module):
         """The channels of :class:`RayValues` at places of the picture, pixels."""
         rays = rays_through_pixels(camera, positions)
         pieces = []
-        for start in range(0, max(len(positions), 1), settings.rays_at_once):
-            window = slice(start, start + settings.rays_at_once)
+        at_once = settings.rays_at_once * (1 if self.device.type == "cpu" else 32)
+        for start in range(0, max(len(positions), 1), at_once):
+            window = slice(start, start + at_once)
             part = Rays(rays.origins[window], rays.directions[window])
             pieces.append(self.render_rays(state, part, settings, edit=edit))
         names = RayValues.__dataclass_fields__

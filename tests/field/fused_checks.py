@@ -12,6 +12,7 @@ from conftest import any_pose, bent_pose, camera_above
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar, RenderSettings
+from handavatar.field.anchors import nearest_anchors
 from handavatar.field.kernels import Kernel
 from handavatar.field.occupancy import Occupancy, PairOccupancy
 from handavatar.hand.parts import Parts
@@ -117,3 +118,20 @@ def test_a_picture_is_the_same(small_avatar: HandAvatar, kernel: Kernel, largest
     assert float(expected.alpha.sum()) > 15
     error = (found.color - expected.color).abs()
     assert float(error.max()) < largest
+
+
+def test_the_nearest_anchors_are_found() -> None:
+    generator = torch.Generator().manual_seed(4)
+    anchors = torch.randn(300, 3, generator=generator).to(DEVICE)
+    for count in (0, 1, 70):
+        queries = torch.randn(count, 3, generator=generator).to(DEVICE)
+        expected = nearest_anchors(anchors, queries)
+        found = nearest_anchors(anchors, queries, kernel="triton")
+        assert torch.equal(found.indices, expected.indices)
+        torch.testing.assert_close(found.weights, expected.weights)
+
+
+def test_few_or_equal_anchors_are_found_once_each() -> None:
+    anchors = torch.zeros(4, 3, device=DEVICE)
+    found = nearest_anchors(anchors, torch.ones(3, 3, device=DEVICE), kernel="triton").indices
+    assert found.sort(dim=1).values.tolist() == 3 * [[0, 1, 2, 3]]

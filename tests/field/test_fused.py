@@ -19,4 +19,4 @@ def test_the_fused_pair_decoder() -> None:
         [*command, str(checks)], env=environment, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]
-    assert "13 passed" in done.stdout, done.stdout[-500:]
+    assert "15 passed" in done.stdout, done.stdout[-500:]

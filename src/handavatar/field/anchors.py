@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from handavatar.field.kernels import Kernel
 from handavatar.geometry.meshes import SurfacePoints, sample_surface_evenly
 from handavatar.hand.rig import Rig
 
@@ -56,14 +57,25 @@ def nearest_anchors(
     anchors: Float[Tensor, "anchors 3"],
     queries: Float[Tensor, "queries 3"],
     count: int = NUM_NEIGHBOURS,
+    kernel: Kernel = "torch",
 ) -> Neighbours:
     """The ``count`` nearest anchors by a k-d tree (a brute-force search on a GPU).
 
     The choice of neighbours has no gradient; their weights have one, to both arguments.
 
+    Args:
+        anchors: metres.
+        queries: metres.
+        count: of neighbours.
+        kernel: any but ``torch`` searches for four by :mod:`handavatar.field.fused`.
+
     Source: paper Sec. 3.3, N^n = 4 nearest by Euclidean distance.
     """
-    if queries.device.type == "cpu":
+    if kernel != "torch" and count == NUM_NEIGHBOURS:
+        from handavatar.field.fused import four_nearest
+
+        indices = four_nearest(anchors, queries)
+    elif queries.device.type == "cpu":
         tree = cKDTree(anchors.detach().numpy())
         _, found = tree.query(queries.detach().numpy(), k=count)
         indices = torch.from_numpy(found.astype("int64")).reshape(-1, count)

@@ -5,8 +5,9 @@ from typing import Literal
 
 import torch
 
-Precision = Literal["ieee", "tf32", "bf16"]
-"""Of the factors of matrix products; sums and everything else have 32 bits."""
+Precision = Literal["ieee", "tf32x3", "tf32", "bf16"]
+"""Of the factors of matrix products; sums and everything else have 32 bits. Three products of
+19-bit factors (``tf32x3``) are as good as one of 32-bit factors (``ieee``)."""
 Kernel = Literal["torch", "triton", "triton-tf32", "triton-bf16"]
 """Torch's operations, or :mod:`handavatar.field.fused` with factors of 32 bits or shorter ones."""
 PRECISIONS: dict[Kernel, Precision] = {

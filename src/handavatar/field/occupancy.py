@@ -247,7 +247,7 @@ class PairOccupancy(nn.Module):
         self.chunk = chunk
         self.connections = connections
         self.sharpness = sharpness
-        self._packed: tuple[tuple[object, ...], PackedWeights] | None = None
+        self._packed: dict[Precision, tuple[tuple[object, ...], PackedWeights]] = {}
         self.register_buffer("pairs", torch.tensor(connections), persistent=False)
 
     def encode(self, parts: Parts, posed: PosedHand) -> HandCodes:
@@ -259,7 +259,8 @@ class PairOccupancy(nn.Module):
     ) -> Occupancy:
         """Occupancy at world points (metres), without gradient; the fast way."""
         # A core's cache wants small pieces; a GPU wants large ones, one after the other.
-        chunk = self.chunk if points.device.type == "cpu" else 128 * self.chunk
+        pieces_at_once = 1 if points.device.type == "cpu" else 128 if kernel == "torch" else 1024
+        chunk = pieces_at_once * self.chunk
         starts = range(0, max(len(points), 1), chunk)
         chunks = [points[start : start + chunk] for start in starts]
         pieces = mapped(lambda piece: self._chunk_occupancy(codes, piece, kernel), chunks)
@@ -281,14 +282,27 @@ class PairOccupancy(nn.Module):
         return self.of_items(codes, points, items)
 
     def of_items(
-        self, codes: HandCodes, points: Float[Tensor, "points 3"], items: PairItems
+        self,
+        codes: HandCodes,
+        points: Float[Tensor, "points 3"],
+        items: PairItems,
+        kernel: Kernel = "torch",
     ) -> Float[Tensor, "points"]:
         """Occupancy with gradient, from the given pairs alone.
 
         With the items that :meth:`forward` found to decide, value and gradient equal those of
         the full evaluation, at a fraction of the work.
+
+        Args:
+            codes: of the posed hand.
+            points: world, metres.
+            items: of these points.
+            kernel: any but ``torch`` gives no gradient; factors have 32 bits with all of them.
         """
-        logits = self.wanted_logits(codes, points, items)
+        if kernel == "torch":
+            logits = self.wanted_logits(codes, points, items)
+        else:
+            logits = self._fused_logits(codes, points, items, PRECISIONS["triton"])
         slots = (items.points[:, None] * NUM_BONES + self.pairs[items.pairs])[items.is_wanted]
         parts = self.fusion.over_pairs(logits, slots, len(points) * NUM_BONES, slope=self.sharpness)
         return self.fusion.over_parts(parts.view(-1, NUM_BONES))
@@ -424,10 +438,10 @@ class PairOccupancy(nn.Module):
         network = self.decoder.pointnet
         # Weights that a step has changed, or that were moved, are packed anew.
         state = tuple((weight.data_ptr(), weight._version) for weight in self.decoder.parameters())
-        if self._packed is None or self._packed[0] != (precision, state):
+        if precision not in self._packed or self._packed[precision][0] != state:
             packed = pack_weights(network, self.decoder.mlp, precision, LENGTH_SCALE, LOGIT_SCALE)
-            self._packed = (precision, state), packed
-        weights = self._packed[1]
+            self._packed[precision] = state, packed
+        weights = self._packed[precision][1]
         biases = codes.part_codes @ weights.of_code.T + network.input.bias
         frames = codes.boxes.bone_from_world
         members = self.pairs[items.pairs]

@@ -6,6 +6,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from handavatar.geometry.rotations import rigid_transform
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -132,14 +134,11 @@ def framing_camera(
 
 
 def look_at(
-    eye: Float[Tensor, "3"], target: Float[Tensor, "3"], up: Float[Tensor, "3"]
-) -> Float[Tensor, "4 4"]:
+    eye: Float[Tensor, "*batch 3"], target: Float[Tensor, "3"], up: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 4 4"]:
     """``camera_from_world`` of a camera at ``eye`` that looks at ``target``, ``up`` upwards."""
-    forward = torch.nn.functional.normalize(target - eye, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+    forward = torch.nn.functional.normalize(target - eye, dim=-1)
+    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=-1)
     down = torch.linalg.cross(forward, right)
-    rotation = torch.stack([right, down, forward])
-    transform = torch.eye(4, dtype=eye.dtype, device=eye.device)
-    transform[:3, :3] = rotation
-    transform[:3, 3] = -rotation @ eye
-    return transform
+    rotation = torch.stack([right, down, forward], dim=-2)
+    return rigid_transform(rotation, -(rotation @ eye[..., None])[..., 0])

@@ -56,24 +56,44 @@ def rasterize(
         camera: the view.
     """
     pixels, depths = project(camera, vertices)
+    return rasterize_projected(pixels, depths, faces, camera.width, camera.height)
+
+
+@torch.no_grad()
+def rasterize_projected(
+    pixels: Float[Tensor, "vertices 2"],
+    depths: Float[Tensor, "vertices"],
+    faces: Int[Tensor, "faces 3"],
+    width: int,
+    height: int,
+) -> Fragments:
+    """:func:`rasterize` of vertices that are projected already.
+
+    Args:
+        pixels: image positions, of 32 or 64 bits.
+        depths: metres along the optical axis; their precision is that of the result.
+        faces: either winding.
+        width: of the image, pixels.
+        height: of the image, pixels.
+    """
     corners, corner_depths = pixels.double()[faces], depths.double()[faces]
     nearest = torch.full(
-        (camera.height * camera.width,),
+        (height * width,),
         torch.iinfo(torch.int64).max,
         dtype=torch.int64,
-        device=vertices.device,
+        device=depths.device,
     )
     drawn = is_before_camera(corner_depths).nonzero()[:, 0]
     lower, upper = corners[drawn].amin(1), corners[drawn].amax(1)
-    for row, x, y in pixels_in_boxes(lower, upper, camera.width, camera.height):
+    for row, x, y in pixels_in_boxes(lower, upper, width, height):
         face = drawn[row]
         weights, covers = weights_in_image(corners[face], torch.stack([x, y], dim=-1) + 0.5)
         face, x, y = face[covers], x[covers], y[covers]
         depth = 1 / (weights[covers] / corner_depths[face]).sum(-1)
         # Positive floats order like their bits: one integer holds depth first, then the face.
         key = (depth.float().view(torch.int32).long() << 32) | face
-        nearest.scatter_reduce_(0, y * camera.width + x, key, "amin")
-    return _fragments(nearest, corners, corner_depths, camera, vertices.dtype)
+        nearest.scatter_reduce_(0, y * width + x, key, "amin")
+    return _fragments(nearest, corners, corner_depths, (height, width), depths.dtype)
 
 
 def interpolate(
@@ -158,15 +178,14 @@ def _fragments(
     nearest: Int[Tensor, "pixels"],
     corners: Float[Tensor, "faces 3 2"],
     corner_depths: Float[Tensor, "faces 3"],
-    camera: Camera,
+    shape: tuple[int, int],
     dtype: torch.dtype,
 ) -> Fragments:
     """Depth and weights of the winning faces, computed once more at full precision."""
-    shape = (camera.height, camera.width)
     pixel = (nearest != torch.iinfo(torch.int64).max).nonzero()[:, 0]
     face = nearest[pixel] & 0xFFFFFFFF
-    x = pixel % camera.width
-    y = torch.div(pixel, camera.width, rounding_mode="floor")
+    x = pixel % shape[1]
+    y = torch.div(pixel, shape[1], rounding_mode="floor")
     weights, _ = weights_in_image(corners[face], torch.stack([x, y], dim=-1) + 0.5)
     per_depth = weights / corner_depths[face]
     inverse_depth = per_depth.sum(-1)

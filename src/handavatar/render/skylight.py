@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from handavatar.geometry.cameras import Camera, look_at, project
-from handavatar.render.rasterize import rasterize
+from handavatar.geometry.cameras import look_at
+from handavatar.render.rasterize import rasterize_projected
 
 SIZE = 128
 """Pixels along a side of a depth picture: 1 to 2 mm each on a hand."""
@@ -59,42 +59,70 @@ def sky_light(
         normals: unit, of the surface at the points.
         directions: unit, towards the lights.
     """
-    light = points.new_zeros(len(points), len(directions))
     middle = (vertices.amin(0) + vertices.amax(0)) / 2
-    reach = 1.02 * float((vertices - middle).norm(dim=-1).max())
+    focal = SIZE / 2 * _DISTANCE / (1.02 * (vertices - middle).norm(dim=-1).max())
     lifted = points + LIFT * normals
-    for number, direction in enumerate(directions):
-        cosine = normals @ direction
-        facing = (cosine > 0).nonzero()[:, 0]
-        camera = _camera_from(direction, middle, reach)
-        nearest = rasterize(vertices, faces, camera).depth
-        pixels, depths = project(camera, lifted[facing])
-        hidden_behind = nearest.flatten() + SLACK
-        light[facing, number] = cosine[facing] * _lit_share(hidden_behind, pixels, depths)
+    light = points.new_zeros(len(points), len(directions))
+    # A GPU draws all pictures at once; a core's cache holds one.
+    at_once = 1 if points.device.type == "cpu" else max(len(directions), 1)
+    for start in range(0, len(directions), at_once):
+        part = directions[start : start + at_once]
+        views = look_at(middle + _DISTANCE * part, middle, _across(part))
+        hidden_behind = _depth_pictures(vertices, faces, views, focal) + SLACK
+        cosine = normals @ part.T
+        point, number = (cosine > 0).nonzero().unbind(-1)
+        rotation, shift = views[:, :3, :3], views[:, :3, 3]
+        in_camera = torch.einsum("pij,pj->pi", rotation[number], lifted[point]) + shift[number]
+        share = _lit_share(hidden_behind, number, _in_picture(in_camera, focal), in_camera[:, 2])
+        light[point, start + number] = cosine[point, number] * share
     return light
 
 
-def _camera_from(direction: Float[Tensor, "3"], middle: Float[Tensor, "3"], reach: float) -> Camera:
-    up = torch.zeros_like(direction)
-    up[direction.abs().argmin()] = 1
-    focal = SIZE / 2 * _DISTANCE / reach
-    pose = look_at(middle + _DISTANCE * direction, middle, up)
-    return Camera((focal, focal), (SIZE / 2, SIZE / 2), SIZE, SIZE, pose)
+def _across(directions: Float[Tensor, "directions 3"]) -> Float[Tensor, "directions 3"]:
+    """An axis that no direction is near to."""
+    return torch.nn.functional.one_hot(directions.abs().argmin(-1), 3).to(directions)
+
+
+def _in_picture(
+    in_camera: Float[Tensor, "*batch 3"], focal: Float[Tensor, ""]
+) -> Float[Tensor, "*batch 2"]:
+    return in_camera[..., :2] / in_camera[..., 2:] * focal + SIZE / 2
+
+
+def _depth_pictures(
+    vertices: Float[Tensor, "vertices 3"],
+    faces: Int[Tensor, "faces 3"],
+    views: Float[Tensor, "views 4 4"],
+    focal: Float[Tensor, ""],
+) -> Float[Tensor, "views size size"]:
+    """A depth picture of the mesh from each view, all drawn as one, below each other."""
+    in_camera = vertices @ views[:, :3, :3].mT + views[:, None, :3, 3]
+    number = torch.arange(len(views), device=vertices.device)
+    pixels = _in_picture(in_camera, focal).double()
+    pixels[..., 1] += SIZE * number[:, None]
+    all_faces = (faces + len(vertices) * number[:, None, None]).flatten(0, 1)
+    drawn = rasterize_projected(
+        pixels.flatten(0, 1), in_camera[..., 2].flatten(), all_faces, SIZE, SIZE * len(views)
+    )
+    return drawn.depth.unflatten(0, (len(views), SIZE))
 
 
 def _lit_share(
-    hidden_behind: Float[Tensor, "pixels"],
+    hidden_behind: Float[Tensor, "views size size"],
+    views: Int[Tensor, "points"],
     places: Float[Tensor, "points 2"],
     depths: Float[Tensor, "points"],
 ) -> Float[Tensor, "points"]:
+    """How much of the four depths around a place of a view's picture does not hide a point."""
     corner = (places - 0.5).floor()
     share = places - 0.5 - corner
+    column, row = corner.long().unbind(-1)
     total = torch.zeros_like(depths)
     for right in (0, 1):
         for down in (0, 1):
-            x, y = (corner + corner.new_tensor([right, down])).long().clamp(0, SIZE - 1).unbind(-1)
+            x, y = (column + right).clamp(0, SIZE - 1), (row + down).clamp(0, SIZE - 1)
             weight = (share[:, 0] if right else 1 - share[:, 0]) * (
                 share[:, 1] if down else 1 - share[:, 1]
             )
-            total += weight * (depths <= hidden_behind[y * SIZE + x])
+            total += weight * (depths <= hidden_behind[views, y, x])
     return total
