@@ -108,7 +108,9 @@ def _stepped(
     prior = _prior(len(values), camera)
     normal = torch.einsum("pu,p,pv->uv", jacobian, trust, jacobian) + prior
     gradient = torch.einsum("pu,p,p->u", jacobian, trust, residuals) + prior @ moved
-    values = values - torch.linalg.solve(normal, gradient)
+    # On the CPU: for a GPU it is nothing, and torch's solver cannot begin in two threads at once.
+    step = torch.linalg.solve(normal.cpu(), gradient.cpu())
+    values = values - step.to(values.device)
     return HandPose(values[:-3].reshape(-1, 3), values[-3:])
 
 

@@ -72,7 +72,7 @@ class RenderOptions(Look):
     check: int = 0
     overwrite: bool = False
     device: str = "auto"
-    kernel: Kernel = "torch"
+    kernel: Kernel = "auto"
 
 
 def render_motion(options: RenderOptions) -> Path:

@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from handavatar.edit import Edit, Paint
 from handavatar.field.anchors import Neighbours, nearest_anchors, place_anchors
-from handavatar.field.kernels import PRECISIONS, Kernel
+from handavatar.field.kernels import SHORTER, Kernel
 from handavatar.field.occupancy import HandCodes, PairItems, PairOccupancy
 from handavatar.field.shading import (
     AlbedoField,
@@ -46,6 +46,8 @@ from handavatar.render.volume import composite_sparse, visibility
 SCHEMA = 5
 START_LIGHT = 0.65
 """Illumination of an untrained avatar: room to grow brighter and darker."""
+_FEW_ON_A_GPU = 1 << 18
+"""Samples that a GPU evaluates all at once in less time than it takes to choose among them."""
 _OF_LICENSED_RIG = ("illumination.position_codes",)
 """Weights that a licensed rig's arrays could be read from; they follow from the rig."""
 
@@ -118,7 +120,7 @@ class RenderSettings:
     mask_margin: float = 6 / 256
     edge_rays: int = 2
     rays_at_once: int = 4096
-    kernel: Kernel = "torch"
+    kernel: Kernel = "auto"
 
 
 EXACT = RenderSettings(smallest_weight=1e-7, stop=1e-7, coarse=1, mask_margin=math.inf)
@@ -444,7 +446,7 @@ class HandAvatar(nn.Module):
         kept = is_kept.nonzero()
         directed = directed_occupancy(soft)[is_kept]
         # What shorter factors have only found is evaluated again where it can be seen.
-        if torch.is_grad_enabled() or PRECISIONS.get(settings.kernel, "ieee") != "ieee":
+        if torch.is_grad_enabled() or settings.kernel in SHORTER:
             position = torch.full((num_rays * num_samples,), -1, device=depths.device)
             position[is_kept.flatten()] = torch.arange(len(kept), device=depths.device)
             item_position = position[items.points]
@@ -484,20 +486,21 @@ class HandAvatar(nn.Module):
             found.append(replace(result.items, points=flat[result.items.points]))
 
         last = num_samples - 1
-        coarse = torch.tensor(
-            sorted({*range(0, num_samples, settings.coarse), last}), device=depths.device
-        )
+        stride, group = settings.coarse, settings.group
+        if depths.device.type != "cpu" and depths.numel() <= _FEW_ON_A_GPU:
+            stride, group = 1, num_samples
+        coarse = torch.tensor(sorted({*range(0, num_samples, stride), last}), device=depths.device)
         light = depths.new_ones(num_rays)
         alive = torch.arange(num_rays, device=depths.device)
-        for window in coarse.split(settings.group):
+        for window in coarse.split(group):
             evaluate((alive[:, None] * num_samples + window).flatten())
             light[alive] *= (1 - occupancy[alive][:, window]).prod(1)
             alive = alive[light[alive] > settings.stop]
-        if settings.coarse > 1:
+        if stride > 1:
             is_near = soft[:, coarse].amax(-1) > settings.refine_above
             is_lit = (1 - occupancy[:, coarse]).cumprod(1) > settings.stop
             ray, interval = ((is_near[:, :-1] | is_near[:, 1:]) & is_lit[:, :-1]).nonzero().T
-            between = coarse[interval][:, None] + torch.arange(1, settings.coarse).to(coarse)
+            between = coarse[interval][:, None] + torch.arange(1, stride, device=coarse.device)
             is_between = between < coarse[interval + 1][:, None]
             evaluate((ray[:, None] * num_samples + between)[is_between])
         items = PairItems(

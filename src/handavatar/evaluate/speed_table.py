@@ -45,8 +45,8 @@ from handavatar.hand.pose_sampling import GESTURES, gesture_rotations
 from handavatar.plain import plain_rays
 
 _WAYS = {
-    "exact": replace(EXACT, edge_rays=1),
-    "near-exact": RenderSettings(edge_rays=1),
+    "exact": replace(EXACT, edge_rays=1, kernel="torch"),
+    "near-exact": RenderSettings(edge_rays=1, kernel="torch"),
 }
 """As ``render --quality`` has them, but with one ray a pixel like the reference."""
 _KERNEL_WAYS = {

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from handavatar.field.kernels import Kernel
+from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.geometry.meshes import SurfacePoints, sample_surface_evenly
 from handavatar.hand.rig import Rig
 
@@ -57,7 +57,7 @@ def nearest_anchors(
     anchors: Float[Tensor, "anchors 3"],
     queries: Float[Tensor, "queries 3"],
     count: int = NUM_NEIGHBOURS,
-    kernel: Kernel = "torch",
+    kernel: Kernel = "auto",
 ) -> Neighbours:
     """The ``count`` nearest anchors by a k-d tree (a brute-force search on a GPU).
 
@@ -67,12 +67,14 @@ def nearest_anchors(
         anchors: metres.
         queries: metres.
         count: of neighbours.
-        kernel: any but ``torch`` searches for four by :mod:`handavatar.field.fused`.
+        kernel: Triton's search for four by :mod:`handavatar.field.fused_anchors`.
 
     Source: paper Sec. 3.3, N^n = 4 nearest by Euclidean distance.
     """
+    if kernel == "auto":
+        kernel = chosen_kernel(kernel, queries.device)
     if kernel != "torch" and count == NUM_NEIGHBOURS:
-        from handavatar.field.fused import four_nearest
+        from handavatar.field.fused_anchors import four_nearest
 
         indices = four_nearest(anchors, queries)
     elif queries.device.type == "cpu":

@@ -1,9 +1,13 @@
-"""The pair decoder and the search for anchors in Triton kernels, for NVIDIA GPUs.
+"""The occupancy field in Triton kernels, for NVIDIA GPUs.
 
-Optional: Triton comes with torch's CUDA builds and is imported here alone. Two kernels compute
-what ``PairOccupancy._item_logits`` computes with torch's operations, without gradient: a *trunk*
-for every pair that has a point, up to the last block of its PointNet, and *answers*, the last block
-and the MLP, for those of the two parts that were asked; what lies between layers stays on the chip.
+Optional: Triton comes with torch's CUDA builds and is imported here and in
+:mod:`handavatar.field.fused_anchors` alone. The kernels compute what
+``PairOccupancy._chunk_occupancy`` computes with torch's operations, without gradient. *Boxes* finds
+the part boxes that hold a point and *listed* the pairs to decode. Of the decoder, a *trunk* runs
+for every such pair, up to the last block of its PointNet, and *answers*, the last block and the
+MLP, for those of the two parts that were asked; what lies between layers stays on the chip. The
+largest answers are found on the way, and *values* makes occupancies of them.
+
 Weights come from one buffer, in the order in which the layers need them. Layers that no
 nonlinearity separates are one: the opening's shortcut is an affine map of the place, and the
 PointNet's output is part of the layers that read it.
@@ -24,16 +28,20 @@ from torch import Tensor, nn
 
 from handavatar.field.kernels import Precision
 from handavatar.field.layers import PointNet, ResidualBlock, SkipMLP
+from handavatar.hand.parts import PartBoxes
+from handavatar.hand.pose import NUM_BONES
 
 _LAUNCHES: dict[Precision, tuple[int, int]] = {
-    "ieee": (64, 4),
     "tf32x3": (64, 4),
     "tf32": (64, 4),
     "bf16": (128, 8),
 }
 """Items at a time in one program, and its warps."""
-_QUERIES = 64
-"""Queries at a time in one program of the search for anchors."""
+_POINTS = 128
+"""Points at a time in one program."""
+_NUM_BONES: tl.constexpr = tl.constexpr(NUM_BONES)
+_NOBODY = {kind: torch.iinfo(kind).min for kind in (torch.int32, torch.int64)}
+"""Where no answer was given; smaller than every answer."""
 _IS_INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 
 
@@ -135,7 +143,7 @@ def _own(values, hidden, out, matrices, PRECISION: tl.constexpr, IS_INTERPRETED:
 
 @triton.jit
 def _trunk(
-    points, point_of, members, transforms, code_biases, shortcut_biases,
+    points, point_of, pair_of, pairs, transforms, code_biases, shortcut_biases,
     matrices, vectors, tokens, count,
     BLOCK: tl.constexpr, PRECISION: tl.constexpr, IS_INTERPRETED: tl.constexpr,
 ):  # fmt: skip
@@ -143,13 +151,13 @@ def _trunk(
     is_item = item < count
     point = points + 3 * tl.load(point_of + item, mask=is_item, other=0)
     x, y, z = tl.load(point), tl.load(point + 1), tl.load(point + 2)
-    pair = members + 2 * item
+    pair = pairs + 2 * tl.load(pair_of + item, mask=is_item, other=0)
     first = _opened(
-        tl.load(pair, mask=is_item, other=0), x, y, z,
+        tl.load(pair), x, y, z,
         transforms, code_biases, shortcut_biases, matrices, vectors, PRECISION, IS_INTERPRETED,
     )  # fmt: skip
     second = _opened(
-        tl.load(pair + 1, mask=is_item, other=0), x, y, z,
+        tl.load(pair + 1), x, y, z,
         transforms, code_biases, shortcut_biases, matrices, vectors, PRECISION, IS_INTERPRETED,
     )  # fmt: skip
     matrices += 12288
@@ -169,13 +177,15 @@ def _trunk(
 
 @triton.jit
 def _answers(
-    tokens, item_of, side_of, matrices, vectors, logits, count,
-    BLOCK: tl.constexpr, PRECISION: tl.constexpr, IS_INTERPRETED: tl.constexpr,
+    tokens, answers, point_of, pair_of, pairs, matrices, vectors, logits, best, winners, count,
+    IS_FUSED: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
+    IS_INTERPRETED: tl.constexpr,
 ):  # fmt: skip
-    answer = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    is_answer = answer < count
-    item = tl.load(item_of + answer, mask=is_answer, other=0).to(tl.int64)
-    side = tl.load(side_of + answer, mask=is_answer, other=0)
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    is_answer = index < count
+    answer = tl.load(answers + index, mask=is_answer, other=0)
+    side = answer % 2
+    item = (answer // 2).to(tl.int64)
     place = tokens + (128 * item)[:, None] + tl.arange(0, 64)[None, :]
     own = tl.load(place + (64 * side)[:, None]).to(tl.float32)
     other = tl.load(place + (64 - 64 * side)[:, None]).to(tl.float32)
@@ -200,7 +210,128 @@ def _answers(
         tl.maximum(third, 0.0), _matrix(matrices + 32768, 128, 128), PRECISION, IS_INTERPRETED
     ) + _vector(vectors + 320, 128)
     logit = tl.sum(tl.maximum(fourth, 0.0) * _vector(vectors + 448, 128), axis=1)
-    tl.store(logits + answer, logit + tl.load(vectors + 576), mask=is_answer)
+    logit += tl.load(vectors + 576)
+    if IS_FUSED:
+        point = tl.load(point_of + item, mask=is_answer, other=0)
+        pair = tl.load(pair_of + item, mask=is_answer, other=0)
+        bone = tl.load(pairs + 2 * pair + side)
+        # Integers that are ordered like the numbers; the lower half of a key says who gave it.
+        bits = logit.to(tl.int32, bitcast=True)
+        ordered = bits ^ ((bits >> 31) & 0x7FFFFFFF)
+        key = (ordered.to(tl.int64) << 32) | (2 * pair + side).to(tl.int64)
+        tl.atomic_max(best + _NUM_BONES * point + bone, ordered, mask=is_answer, sem="relaxed")
+        tl.atomic_max(winners + point, key, mask=is_answer, sem="relaxed")
+    else:
+        tl.store(logits + index, logit, mask=is_answer)
+
+
+@triton.jit
+def _along(row, x, y, z):
+    """One coordinate in a part's frame."""
+    return tl.load(row) * x + tl.load(row + 1) * y + tl.load(row + 2) * z + tl.load(row + 3)
+
+
+@triton.jit
+def _beyond(box, axis, place):
+    """How far a coordinate lies outside of a part's own box, negative inside."""
+    return tl.maximum(tl.load(box + axis) - place, place - tl.load(box + 3 + axis))
+
+
+@triton.jit
+def _boxes(
+    points, transforms, boxes, cut, pairs, held_by, counts, count, margin,
+    NUM_PAIRS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Which boxes hold a point (bits), and how many pairs and answers that makes."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    is_point = index < count
+    x = tl.load(points + 3 * index, mask=is_point, other=0.0)
+    y = tl.load(points + 3 * index + 1, mask=is_point, other=0.0)
+    z = tl.load(points + 3 * index + 2, mask=is_point, other=0.0)
+    held = tl.zeros((BLOCK,), tl.int32)
+    for bone in tl.static_range(_NUM_BONES):
+        row, box = transforms + 12 * bone, boxes + 6 * bone
+        is_inside = is_point
+        for axis in tl.static_range(3):
+            place = _along(row + 4 * axis, x, y, z)
+            is_above = place > tl.load(box + axis) - margin
+            is_inside = is_inside & is_above & (place < tl.load(box + 3 + axis) + margin)
+        held |= is_inside.to(tl.int32) << bone
+    height = tl.zeros((BLOCK,), tl.float32)
+    for axis in tl.static_range(3):
+        place = _along(transforms + 4 * axis, x, y, z)
+        height += (place - tl.load(cut + axis)) * tl.load(cut + 3 + axis)
+    held = tl.where(height < 0, held, 0)
+    num_items = tl.zeros((BLOCK,), tl.int32)
+    num_answers = tl.zeros((BLOCK,), tl.int32)
+    for pair in tl.static_range(NUM_PAIRS):
+        first = (held >> tl.load(pairs + 2 * pair)) & 1
+        second = (held >> tl.load(pairs + 2 * pair + 1)) & 1
+        num_items += first | second
+        num_answers += first + second
+    tl.store(held_by + index, held, mask=is_point)
+    tl.store(counts + index, (num_items.to(tl.int64) << 32) | num_answers, mask=is_point)
+
+
+@triton.jit
+def _listed(
+    held_by, ends, counts, pairs, item_points, item_pairs, answers, count,
+    NUM_PAIRS: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Writes down what the counts have made room for."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    is_point = index < count
+    held = tl.load(held_by + index, mask=is_point, other=0)
+    begin = tl.load(ends + index, mask=is_point, other=0)
+    begin -= tl.load(counts + index, mask=is_point, other=0)
+    item, answer = (begin >> 32).to(tl.int32), (begin & 0xFFFFFFFF).to(tl.int32)
+    for pair in tl.static_range(NUM_PAIRS):
+        first = (held >> tl.load(pairs + 2 * pair)) & 1
+        second = (held >> tl.load(pairs + 2 * pair + 1)) & 1
+        is_item = (first | second) > 0
+        tl.store(item_points + item, index, mask=is_item)
+        tl.store(item_pairs + item, tl.zeros((BLOCK,), tl.int32) + pair, mask=is_item)
+        tl.store(answers + answer, 2 * item, mask=first > 0)
+        answer += first
+        tl.store(answers + answer, 2 * item + 1, mask=second > 0)
+        answer += second
+        item += first | second
+
+
+@triton.jit
+def _number(ordered):
+    bits = ordered ^ ((ordered >> 31) & 0x7FFFFFFF)
+    return bits.to(tl.float32, bitcast=True)
+
+
+@triton.jit
+def _values(
+    points, transforms, boxes, best, winners, whole, soft, deciders, count,
+    margin, softness, sharpness, BLOCK: tl.constexpr,
+):  # fmt: skip
+    """Occupancies of the largest answers; what nobody has answered is nothing."""
+    index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    is_point = index < count
+    x = tl.load(points + 3 * index, mask=is_point, other=0.0)
+    y = tl.load(points + 3 * index + 1, mask=is_point, other=0.0)
+    z = tl.load(points + 3 * index + 2, mask=is_point, other=0.0)
+    winner = tl.load(winners + index, mask=is_point, other=0)
+    ordered = (winner >> 32).to(tl.int32)
+    is_answered = ordered >= -2147483647
+    value = tl.where(is_answered, tl.sigmoid(sharpness * _number(ordered)), 0.0)
+    tl.store(whole + index, value, mask=is_point)
+    decider = tl.where(is_answered, (winner & 0xFFFFFFFF).to(tl.int32), -1)
+    tl.store(deciders + index, decider, mask=is_point)
+    for bone in tl.static_range(_NUM_BONES):
+        row, box = transforms + 12 * bone, boxes + 6 * bone
+        outside = _beyond(box, 0, _along(row, x, y, z))
+        outside = tl.maximum(outside, _beyond(box, 1, _along(row + 4, x, y, z)))
+        outside = tl.maximum(outside, _beyond(box, 2, _along(row + 8, x, y, z)))
+        ramp = tl.minimum(tl.maximum(1 - outside / margin, 0.0), 1.0)
+        ordered = tl.load(best + _NUM_BONES * index + bone, mask=is_point, other=0)
+        value = tl.sigmoid(softness * _number(ordered)) * (ramp * ramp * (3 - 2 * ramp))
+        value = tl.where(ordered >= -2147483647, value, 0.0)
+        tl.store(soft + _NUM_BONES * index + bone, value, mask=is_point)
 
 
 def pack_weights(
@@ -244,33 +375,151 @@ def pack_weights(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class PackedHand:
+    """A posed hand as the kernels read it.
+
+    Attributes:
+        code_biases: of the first layer, its own bias included.
+        shortcut_biases: the same past the first block.
+        transforms: frames of the parts, upper three rows, metres.
+        boxes: lower and upper corner of each part's own box, metres.
+        cut: point and normal of the wrist's plane, in the wrist's frame.
+        margin: how far boxes reach beyond the parts, metres.
+    """
+
+    code_biases: Float[Tensor, "bones 128"]
+    shortcut_biases: Float[Tensor, "bones 64"]
+    transforms: Float[Tensor, "bones 3 4"]
+    boxes: Float[Tensor, "bones 6"]
+    cut: Float[Tensor, "6"]
+    margin: float
+
+
+def pack_hand(
+    weights: PackedWeights,
+    first_bias: Float[Tensor, "128"],
+    part_codes: Float[Tensor, "bones 64"],
+    boxes: PartBoxes,
+) -> PackedHand:
+    """What a pose adds to the weights.
+
+    Args:
+        weights: of the decoder.
+        first_bias: of its first layer.
+        part_codes: encodings of the parts.
+        boxes: of the parts.
+    """
+    code_biases = part_codes @ weights.of_code.T + first_bias
+    return PackedHand(
+        code_biases.detach().contiguous(),
+        (code_biases @ weights.shortcut.T).detach().contiguous(),
+        boxes.bone_from_world[:, :3].detach().contiguous(),
+        torch.cat([boxes.lower, boxes.upper], dim=-1),
+        torch.cat([boxes.cut_point, boxes.cut_normal]),
+        boxes.margin,
+    )
+
+
 def fused_logits(
     weights: PackedWeights,
-    code_biases: Float[Tensor, "bones 128"],
-    bone_from_world: Float[Tensor, "bones 4 4"],
+    hand: PackedHand,
+    pairs: Int[Tensor, "pairs 2"],
     points: Float[Tensor, "points 3"],
     item_points: Int[Tensor, "items"],
-    members: Int[Tensor, "items 2"],
+    item_pairs: Int[Tensor, "items"],
     is_wanted: Bool[Tensor, "items 2"],
 ) -> Float[Tensor, "wanted"]:
     """Logits of the wanted answers, without gradient.
 
     Args:
         weights: packed; with ``tf32`` or ``bf16`` for looking, not for what must be exact.
-        code_biases: the first layer of each part's code, bias included.
-        bone_from_world: frames of the parts, metres.
+        hand: packed.
+        pairs: the two parts of each pair.
         points: in the world, metres.
         item_points: the point of each item.
-        members: the two parts of each item's pair.
-        is_wanted: which of their answers.
+        item_pairs: its pair.
+        is_wanted: which of the two answers.
 
     Source: paper Sec. 3.2 and appendix (local-pair decoder).
     """
-    answer_items, answer_sides = is_wanted.nonzero().unbind(-1)
-    num_items, num_answers = len(members), len(answer_items)
-    token_type = torch.bfloat16 if weights.precision == "bf16" else torch.float32
-    tokens = points.new_empty(num_items, 2, 64, dtype=token_type)
-    logits = points.new_empty(num_answers)
+    answers = is_wanted.flatten().nonzero()[:, 0]
+    logits = points.new_empty(len(answers))
+    _decode(weights, hand, pairs, points, (item_points, item_pairs, answers), logits=logits)
+    return logits
+
+
+def fused_occupancy(
+    weights: PackedWeights,
+    hand: PackedHand,
+    pairs: Int[Tensor, "pairs 2"],
+    points: Float[Tensor, "points 3"],
+    softness: float,
+    sharpness: float,
+) -> tuple[Float[Tensor, "points"], Float[Tensor, "points bones"], Int[Tensor, "points"]]:
+    """Occupancies by maximum fusion, without gradient.
+
+    Args:
+        weights: packed.
+        hand: packed.
+        pairs: the two parts of each pair.
+        points: in the world, metres.
+        softness: the paper's tau.
+        sharpness: what the logit of the whole is multiplied by.
+
+    Returns:
+        Of the whole, softly of each part, and twice the number of the pair that decides, plus one
+        if it is its second part; -1 where there is none.
+
+    Source: paper Sec. 3.2, Eq. 1, and Sec. 3.3, Eq. 3.
+    """
+    points = points.detach().contiguous()
+    count, num_bones, num_pairs = len(points), len(hand.transforms), len(pairs)
+    whole = points.new_empty(count)
+    soft = points.new_empty(count, num_bones)
+    deciders = torch.empty(count, dtype=torch.int32, device=points.device)
+    if count == 0:
+        return whole, soft, deciders
+    grid = (triton.cdiv(count, _POINTS),)
+    held_by = torch.empty_like(deciders)
+    counts = torch.empty(count, dtype=torch.int64, device=points.device)
+    _boxes[grid](
+        points, hand.transforms, hand.boxes, hand.cut, pairs, held_by, counts, count, hand.margin,
+        NUM_PAIRS=num_pairs, BLOCK=_POINTS,
+    )  # fmt: skip
+    ends = counts.cumsum(0)
+    total = int(ends[-1])
+    num_items, num_answers = total >> 32, total & 0xFFFFFFFF
+    item_points, item_pairs = deciders.new_empty(2, num_items)
+    answers = deciders.new_empty(num_answers)
+    best = torch.full_like(soft, _NOBODY[torch.int32], dtype=torch.int32)
+    winners = torch.full_like(counts, _NOBODY[torch.int64])
+    if num_items:
+        _listed[grid](
+            held_by, ends, counts, pairs, item_points, item_pairs, answers, count,
+            NUM_PAIRS=num_pairs, BLOCK=_POINTS,
+        )  # fmt: skip
+        items = item_points, item_pairs, answers
+        _decode(weights, hand, pairs, points, items, best=best, winners=winners)
+    _values[grid](
+        points, hand.transforms, hand.boxes, best, winners, whole, soft, deciders, count,
+        hand.margin, softness, sharpness, BLOCK=_POINTS,
+    )  # fmt: skip
+    return whole, soft, deciders
+
+
+def _decode(
+    weights: PackedWeights,
+    hand: PackedHand,
+    pairs: Int[Tensor, "pairs 2"],
+    points: Float[Tensor, "points 3"],
+    items: tuple[Int[Tensor, "items"], Int[Tensor, "items"], Int[Tensor, "answers"]],
+    logits: Float[Tensor, "answers"] | None = None,
+    best: Int[Tensor, "points bones"] | None = None,
+    winners: Int[Tensor, "points"] | None = None,
+) -> None:
+    """Trunk and answers; into ``logits``, or the largest into ``best`` and ``winners``."""
+    item_points, item_pairs, answers = (part.contiguous() for part in items)
     block, warps = _LAUNCHES[weights.precision]
     constants: dict[str, Any] = {
         "num_warps": warps,
@@ -278,32 +527,39 @@ def fused_logits(
         "PRECISION": weights.precision,
         "IS_INTERPRETED": _IS_INTERPRETED,
     }
-    if num_items:
-        _trunk[(triton.cdiv(num_items, block),)](
-            points.contiguous(),
-            item_points.contiguous(),
-            members.contiguous(),
-            bone_from_world[:, :3].contiguous(),
-            code_biases.contiguous(),
-            (code_biases @ weights.shortcut.T).contiguous(),
+    token_type = torch.bfloat16 if weights.precision == "bf16" else torch.float32
+    tokens = points.new_empty(len(item_points), 2, 64, dtype=token_type)
+    if len(item_points):
+        _trunk[(triton.cdiv(len(item_points), block),)](
+            points.detach().contiguous(),
+            item_points,
+            item_pairs,
+            pairs,
+            hand.transforms,
+            hand.code_biases,
+            hand.shortcut_biases,
             weights.matrices,
             weights.vectors,
             tokens,
-            num_items,
+            len(item_points),
             **constants,
         )
-    if num_answers:
-        _answers[(triton.cdiv(num_answers, block),)](
+    if len(answers):
+        _answers[(triton.cdiv(len(answers), block),)](
             tokens,
-            answer_items.contiguous(),
-            answer_sides.contiguous(),
+            answers,
+            item_points,
+            item_pairs,
+            pairs,
             weights.matrices[weights.num_trunk_matrices :],
             weights.vectors[weights.num_trunk_vectors :],
             logits,
-            num_answers,
+            best,
+            winners,
+            len(answers),
+            IS_FUSED=logits is None,
             **constants,
         )
-    return logits
 
 
 def _shared_first(block: ResidualBlock, width: int) -> list[Tensor]:
@@ -315,77 +571,3 @@ def _shared_first(block: ResidualBlock, width: int) -> list[Tensor]:
 
 def _flat(pieces: list[Tensor]) -> Float[Tensor, "entries"]:
     return torch.cat([piece.detach().contiguous().flatten() for piece in pieces])
-
-
-@triton.jit
-def _nearest(
-    anchors, queries, found, num_queries, num_anchors,
-    BLOCK: tl.constexpr, ANCHORS: tl.constexpr,
-):  # fmt: skip
-    query = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    is_query = query < num_queries
-    x = tl.load(queries + 3 * query, mask=is_query, other=0.0)[:, None]
-    y = tl.load(queries + 3 * query + 1, mask=is_query, other=0.0)[:, None]
-    z = tl.load(queries + 3 * query + 2, mask=is_query, other=0.0)[:, None]
-    far = float("inf")
-    d0 = tl.full((BLOCK,), far, tl.float32)
-    d1, d2, d3 = d0, d0, d0
-    i0 = tl.zeros((BLOCK,), tl.int32)
-    i1, i2, i3 = i0, i0, i0
-    column = tl.arange(0, ANCHORS)
-    for start in range(0, num_anchors, ANCHORS):
-        anchor = start + column
-        place = anchors + 3 * anchor
-        is_anchor = anchor < num_anchors
-        dx = x - tl.load(place, mask=is_anchor, other=far)[None, :]
-        dy = y - tl.load(place + 1, mask=is_anchor, other=far)[None, :]
-        dz = z - tl.load(place + 2, mask=is_anchor, other=far)[None, :]
-        distance = dx * dx + dy * dy + dz * dz
-        lowest, at = tl.min(distance, axis=1, return_indices=True)
-        # The nearest of these anchors goes into the list, then the next, while any is nearer.
-        while tl.max((lowest < d3).to(tl.int32), axis=0) > 0:
-            value, index = lowest, (start + at).to(tl.int32)
-            is_less = value < d0
-            d0, value = tl.where(is_less, value, d0), tl.where(is_less, d0, value)
-            i0, index = tl.where(is_less, index, i0), tl.where(is_less, i0, index)
-            is_less = value < d1
-            d1, value = tl.where(is_less, value, d1), tl.where(is_less, d1, value)
-            i1, index = tl.where(is_less, index, i1), tl.where(is_less, i1, index)
-            is_less = value < d2
-            d2, value = tl.where(is_less, value, d2), tl.where(is_less, d2, value)
-            i2, index = tl.where(is_less, index, i2), tl.where(is_less, i2, index)
-            is_less = value < d3
-            d3 = tl.where(is_less, value, d3)
-            i3 = tl.where(is_less, index, i3)
-            distance = tl.where(column[None, :] == at[:, None], far, distance)
-            lowest, at = tl.min(distance, axis=1, return_indices=True)
-    place = found + 4 * query
-    tl.store(place, i0.to(tl.int64), mask=is_query)
-    tl.store(place + 1, i1.to(tl.int64), mask=is_query)
-    tl.store(place + 2, i2.to(tl.int64), mask=is_query)
-    tl.store(place + 3, i3.to(tl.int64), mask=is_query)
-
-
-def four_nearest(
-    anchors: Float[Tensor, "anchors 3"], queries: Float[Tensor, "queries 3"]
-) -> Int[Tensor, "queries 4"]:
-    """Indices of the four nearest anchors of each query, nearest first; no gradient.
-
-    Every anchor is looked at, and no distance leaves the chip.
-
-    Args:
-        anchors: four or more.
-        queries: in the same units.
-    """
-    found = torch.empty(len(queries), 4, dtype=torch.long, device=queries.device)
-    if len(queries):
-        _nearest[(triton.cdiv(len(queries), _QUERIES),)](
-            anchors.detach().contiguous(),
-            queries.detach().contiguous(),
-            found,
-            len(queries),
-            len(anchors),
-            BLOCK=_QUERIES,
-            ANCHORS=128,
-        )
-    return found

@@ -12,12 +12,13 @@ hold the point, shares first layers between pairs, and is fast.
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+from weakref import WeakKeyDictionary
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from handavatar.field.kernels import PRECISIONS, Kernel, Precision
+from handavatar.field.kernels import PRECISIONS, Kernel, Precision, chosen_kernel
 from handavatar.field.layers import PointNet, SkipMLP
 from handavatar.field.threads import mapped
 from handavatar.hand.parts import PartBoxes, Parts
@@ -25,7 +26,7 @@ from handavatar.hand.pose import CONNECTED_PAIRS, NUM_BONES
 from handavatar.hand.rig import PosedHand
 
 if TYPE_CHECKING:
-    from handavatar.field.fused import PackedWeights
+    from handavatar.field.fused import PackedHand, PackedWeights
 
 CODE_WIDTH = 64
 LENGTH_SCALE = 20.0
@@ -248,6 +249,9 @@ class PairOccupancy(nn.Module):
         self.connections = connections
         self.sharpness = sharpness
         self._packed: dict[Precision, tuple[tuple[object, ...], PackedWeights]] = {}
+        self._hands: WeakKeyDictionary[HandCodes, tuple[PackedWeights, PackedHand]] = (
+            WeakKeyDictionary()
+        )
         self.register_buffer("pairs", torch.tensor(connections), persistent=False)
 
     def encode(self, parts: Parts, posed: PosedHand) -> HandCodes:
@@ -255,15 +259,19 @@ class PairOccupancy(nn.Module):
         return hand_codes(self.encoder.factorised, parts, posed, self.margin)
 
     def forward(
-        self, codes: HandCodes, points: Float[Tensor, "points 3"], kernel: Kernel = "torch"
+        self, codes: HandCodes, points: Float[Tensor, "points 3"], kernel: Kernel = "auto"
     ) -> Occupancy:
         """Occupancy at world points (metres), without gradient; the fast way."""
+        if kernel == "auto":
+            kernel = chosen_kernel(kernel, points.device)
         # A core's cache wants small pieces; a GPU wants large ones, one after the other.
         pieces_at_once = 1 if points.device.type == "cpu" else 128 if kernel == "torch" else 1024
         chunk = pieces_at_once * self.chunk
         starts = range(0, max(len(points), 1), chunk)
         chunks = [points[start : start + chunk] for start in starts]
         pieces = mapped(lambda piece: self._chunk_occupancy(codes, piece, kernel), chunks)
+        if len(pieces) == 1:
+            return pieces[0]
         items = PairItems(
             torch.cat([p.items.points + start for p, start in zip(pieces, starts, strict=True)]),
             torch.cat([p.items.pairs for p in pieces]),
@@ -383,6 +391,8 @@ class PairOccupancy(nn.Module):
 
         Only pairs with a box that holds the point are decoded.
         """
+        if kernel != "torch" and isinstance(self.fusion, MaximumFusion):
+            return self._fused_occupancy(codes, points, PRECISIONS[kernel])
         num_points = len(points)
         local = local_points(codes.boxes, points)
         is_in_box = contains(codes.boxes, local)
@@ -433,7 +443,34 @@ class PairOccupancy(nn.Module):
         precision: Precision,
     ) -> Float[Tensor, "wanted"]:
         """The same by the kernels of :mod:`handavatar.field.fused`."""
-        from handavatar.field.fused import fused_logits, pack_weights
+        from handavatar.field.fused import fused_logits
+
+        weights, hand = self._packed_for(codes, precision)
+        pairs = self.pairs.int()
+        return fused_logits(
+            weights, hand, pairs, points, items.points, items.pairs, items.is_wanted
+        )
+
+    def _fused_occupancy(
+        self, codes: HandCodes, points: Float[Tensor, "points 3"], precision: Precision
+    ) -> Occupancy:
+        """:meth:`_chunk_occupancy` with maximum fusion, all of it in kernels."""
+        from handavatar.field.fused import fused_occupancy
+
+        weights, hand = self._packed_for(codes, precision)
+        pairs = self.pairs.int()
+        whole, soft, deciders = fused_occupancy(
+            weights, hand, pairs, points, self.softness, self.sharpness
+        )
+        decided = (deciders >= 0).nonzero()[:, 0]
+        decider = deciders[decided].long()
+        is_wanted = torch.nn.functional.one_hot(decider % 2, 2).bool()
+        return Occupancy(whole, soft, PairItems(decided, decider // 2, is_wanted))
+
+    def _packed_for(
+        self, codes: HandCodes, precision: Precision
+    ) -> "tuple[PackedWeights, PackedHand]":
+        from handavatar.field.fused import pack_hand, pack_weights
 
         network = self.decoder.pointnet
         # Weights that a step has changed, or that were moved, are packed anew.
@@ -442,10 +479,11 @@ class PairOccupancy(nn.Module):
             packed = pack_weights(network, self.decoder.mlp, precision, LENGTH_SCALE, LOGIT_SCALE)
             self._packed[precision] = state, packed
         weights = self._packed[precision][1]
-        biases = codes.part_codes @ weights.of_code.T + network.input.bias
-        frames = codes.boxes.bone_from_world
-        members = self.pairs[items.pairs]
-        return fused_logits(weights, biases, frames, points, items.points, members, items.is_wanted)
+        known = self._hands.get(codes)
+        if known is None or known[0] is not weights:
+            hand = pack_hand(weights, network.input.bias, codes.part_codes, codes.boxes)
+            known = self._hands[codes] = weights, hand
+        return known
 
     def _part_features(
         self,
@@ -458,8 +496,13 @@ class PairOccupancy(nn.Module):
         biases = layer.bias + codes.part_codes @ layer.weight[:, :CODE_WIDTH].T
         position_weight = LENGTH_SCALE * layer.weight[:, CODE_WIDTH:].T
         needed = is_needed.T
-        counts = needed.sum(-1).tolist()
         row_of = needed.flatten().cumsum(0).view_as(needed) - 1
+        if local.device.type != "cpu":
+            # A GPU spends more on each operation's start than on moving the biases.
+            bone, point = needed.nonzero().unbind(-1)
+            opened = biases[bone] + local[point, bone] @ position_weight
+            return self.decoder.pointnet.blocks[0](opened), row_of
+        counts = needed.sum(-1).tolist()
         features = local.new_empty(sum(counts), layer.out_features)
         start = 0
         for bone, count in enumerate(counts):

@@ -127,9 +127,9 @@ def framing_camera(
     """
     lower, upper = points.amin(0), points.amax(0)
     middle, reach = (lower + upper) / 2, float((upper - lower).max())
-    towards = torch.nn.functional.normalize(torch.tensor(direction), dim=0)
+    towards = torch.nn.functional.normalize(points.new_tensor(direction), dim=0)
     focal = size * (distance - reach / 2) / (room * reach)
-    pose = look_at(middle + distance * towards, middle, torch.tensor([-1.0, 0.0, 0.0]))
+    pose = look_at(middle + distance * towards, middle, points.new_tensor([-1.0, 0.0, 0.0]))
     return Camera((focal, focal), (size / 2, size / 2), size, size, pose)
 
 

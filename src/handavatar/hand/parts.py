@@ -103,7 +103,7 @@ class Parts:
             # The rim runs along its faces' half edges, so this area vector points off the hand.
             area = torch.linalg.cross(spokes.roll(-1, 0), spokes).sum(0)
             normal = torch.nn.functional.normalize(area, dim=0)
-            outmost = rim[(spokes @ normal).argmax()]
+            outmost = rim[(spokes @ normal).argmax(0, keepdim=True)][0]
         return PartBoxes(bone_from_world, lower, upper, margin, outmost, normal)
 
 

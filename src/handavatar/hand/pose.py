@@ -1,9 +1,10 @@
 """Hand poses: the bone tree, joint rotations and the placement of the wrist."""
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.geometry.rotations import left_jacobian, matrix_from_axis_angle, rigid_transform
@@ -75,14 +76,18 @@ def bone_transforms(
     Departs: the printed chain multiplies absolute joint positions; only offsets from the parent
         joint compose, as in MANO.
     """
-    local_rotations = matrix_from_axis_angle(rotations)
     joints = rest_joints.expand(*rotations.shape[:-2], -1, -1)
-    chain: list[Tensor] = []
-    for bone, parent in enumerate(BONE_PARENTS):
-        offset = joints[..., bone, :] - (joints[..., parent, :] if parent >= 0 else 0)
-        parent_from_bone = rigid_transform(local_rotations[..., bone, :, :], offset)
-        chain.append(parent_from_bone if parent < 0 else chain[parent] @ parent_from_bone)
-    return torch.stack(chain, dim=-3)
+    parents, order, levels = _kinematic_indices(rotations.device)
+    before = torch.cat([torch.zeros_like(joints[..., :1, :]), joints], dim=-2)
+    offsets = joints - before.index_select(-2, parents)
+    parent_from_bone = rigid_transform(matrix_from_axis_angle(rotations), offsets)
+    world_from_bone = parent_from_bone[..., :1, :, :]
+    for bones, carriers in levels:
+        placed = world_from_bone.index_select(-3, carriers) @ parent_from_bone.index_select(
+            -3, bones
+        )
+        world_from_bone = torch.cat([world_from_bone, placed], dim=-3)
+    return world_from_bone.index_select(-3, order)
 
 
 def linear_blend_skinning(
@@ -146,3 +151,25 @@ def _chain(bone: int) -> list[int]:
 
 _BEHIND = [[float(j in _chain(b)) for b in range(NUM_BONES)] for j in range(NUM_BONES)]
 """Row ``j``: one for bone ``j`` itself and for those that hang on it."""
+
+
+@cache
+def _kinematic_indices(
+    device: torch.device,
+) -> tuple[Int[Tensor, "bones"], Int[Tensor, "bones"], list[tuple[Tensor, Tensor]]]:
+    """Indices for walking along all fingers at once.
+
+    Returns:
+        Each bone's parent, counted from 1, 0 for none; where each bone stands once bones are
+        ordered by their distance from the wrist; and for each distance after it the bones, and
+        where their parents stand.
+    """
+    ordered = sorted(range(NUM_BONES), key=lambda bone: (len(_chain(bone)), bone))
+    place = [ordered.index(bone) for bone in range(NUM_BONES)]
+    levels = []
+    for depth in range(2, len(_chain(ordered[-1])) + 1):
+        bones = [bone for bone in ordered if len(_chain(bone)) == depth]
+        carriers = [place[BONE_PARENTS[bone]] for bone in bones]
+        levels.append((torch.tensor(bones, device=device), torch.tensor(carriers, device=device)))
+    parents = torch.tensor([parent + 1 for parent in BONE_PARENTS], device=device)
+    return parents, torch.tensor(place, device=device), levels

@@ -93,7 +93,7 @@ class ViewOptions:
     motion: tuple[Path, ...] = ()
     out: Path = Path("edited")
     device: str = "auto"
-    kernel: Kernel = "torch"
+    kernel: Kernel = "auto"
 
 
 class ViewServer:
