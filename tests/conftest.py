@@ -174,7 +174,8 @@ def any_pose(rig: Rig, turn: float = 0.0, shift: float = 0.0) -> PosedHand:
     generator = torch.Generator().manual_seed(1)
     rotations = 0.3 * torch.randn(NUM_BONES, 3, generator=generator)
     rotations[0] = turn * torch.tensor([0.6, 0.0, 0.8])
-    return rig.shaped().posed(HandPose(rotations, shift * torch.tensor([1.0, -2.0, 3.0])))
+    pose = HandPose(rotations, shift * torch.tensor([1.0, -2.0, 3.0]))
+    return rig.shaped().posed(pose.to(rig.template_vertices.device))
 
 
 @pytest.fixture(scope="session")

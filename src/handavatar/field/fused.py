@@ -3,10 +3,11 @@
 Optional: Triton comes with torch's CUDA builds and is imported here and in
 :mod:`handavatar.field.fused_anchors` alone. The kernels compute what
 ``PairOccupancy._chunk_occupancy`` computes with torch's operations, without gradient. *Boxes* finds
-the part boxes that hold a point and *listed* the pairs to decode. Of the decoder, a *trunk* runs
-for every such pair, up to the last block of its PointNet, and *answers*, the last block and the
-MLP, for those of the two parts that were asked; what lies between layers stays on the chip. The
-largest answers are found on the way, and *values* makes occupancies of them.
+the part boxes that hold a point and *listed* what is to be decoded, pair by pair, so that a program
+reads the codes of two parts only. Of the decoder, a *trunk* runs for every point of a pair, up to
+the last block of its PointNet, and *answers*, the last block and the MLP, for those of the two
+parts that were asked; what lies between layers stays on the chip. The largest answers are found on
+the way, and *values* makes occupancies of them.
 
 Weights come from one buffer, in the order in which the layers need them. Layers that no
 nonlinearity separates are one: the opening's shortcut is an affine map of the place, and the
@@ -18,6 +19,7 @@ Without a GPU the kernels run in Triton's interpreter (``TRITON_INTERPRET=1``), 
 import math
 import os
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, cast
 
 import torch
@@ -32,16 +34,16 @@ from handavatar.hand.parts import PartBoxes
 from handavatar.hand.pose import NUM_BONES
 
 _LAUNCHES: dict[Precision, tuple[int, int]] = {
-    "tf32x3": (64, 4),
-    "tf32": (64, 4),
+    "tf32x3": (128, 8),
+    "tf32": (128, 8),
     "bf16": (128, 8),
 }
 """Items at a time in one program, and its warps."""
 _POINTS = 128
 """Points at a time in one program."""
 _NUM_BONES: tl.constexpr = tl.constexpr(NUM_BONES)
-_NOBODY = {kind: torch.iinfo(kind).min for kind in (torch.int32, torch.int64)}
-"""Where no answer was given; smaller than every answer."""
+_NOBODY = torch.iinfo(torch.int64).min
+"""Where no answer was given; smaller than every answer, and so is its upper half."""
 _IS_INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
 
 
@@ -51,9 +53,10 @@ class PackedWeights:
 
     Attributes:
         matrices: of the trunk, then of the answers; inputs times outputs each.
-        vectors: the position's rows of the first layer and of its shortcut, then all biases.
-        of_code: the code's part of the first layer.
-        shortcut: from the first layer's output past the first block.
+        vectors: all biases but those before the first ReLU, then the last layer.
+        first: of the first layer and of the shortcut past the first block: from a part's code and
+            the place in its frame, in metres.
+        first_bias: what both add.
         precision: of the matrices.
         num_trunk_matrices: entries of ``matrices`` that belong to the trunk.
         num_trunk_vectors: entries of ``vectors`` that do.
@@ -61,8 +64,8 @@ class PackedWeights:
 
     matrices: Float[Tensor, "entries"]
     vectors: Float[Tensor, "rows"]
-    of_code: Float[Tensor, "128 64"]
-    shortcut: Float[Tensor, "64 128"]
+    first: Float[Tensor, "192 67"]
+    first_bias: Float[Tensor, "192"]
     precision: Precision
     num_trunk_matrices: int
     num_trunk_vectors: int
@@ -70,13 +73,15 @@ class PackedWeights:
 
 @triton.jit
 def _product(values, matrix, PRECISION: tl.constexpr, IS_INTERPRETED: tl.constexpr):
-    if PRECISION == "bf16":
-        rounded = values.to(tl.bfloat16)
-        if IS_INTERPRETED:
-            # The interpreter's product of two bfloat16 is wrong; this is the same number.
-            return tl.dot(rounded.to(tl.float32), matrix.to(tl.float32), input_precision="ieee")
-        return tl.dot(rounded, matrix)
-    return tl.dot(values, matrix, input_precision=PRECISION)
+    if PRECISION != "bf16":
+        product = tl.dot(values, matrix, input_precision=PRECISION)
+    elif IS_INTERPRETED:
+        # The interpreter's product of two bfloat16 is wrong; this is the same number.
+        rounded = values.to(tl.bfloat16).to(tl.float32)
+        product = tl.dot(rounded, matrix.to(tl.float32), input_precision="ieee")
+    else:
+        product = tl.dot(values.to(tl.bfloat16), matrix)
+    return product
 
 
 @triton.jit
@@ -91,30 +96,36 @@ def _vector(pointer, SIZE: tl.constexpr):
 
 
 @triton.jit
+def _along(row, x, y, z):
+    """One coordinate in a part's frame."""
+    return tl.load(row) * x + tl.load(row + 1) * y + tl.load(row + 2) * z + tl.load(row + 3)
+
+
+@triton.jit
+def _affine(rows, x, y, z, STRIDE: tl.constexpr, SIZE: tl.constexpr):
+    """An affine map of the place: three rows of factors, then what is added."""
+    return (
+        x[:, None] * _vector(rows, SIZE)
+        + y[:, None] * _vector(rows + STRIDE, SIZE)
+        + z[:, None] * _vector(rows + 2 * STRIDE, SIZE)
+        + _vector(rows + 3 * STRIDE, SIZE)
+    )
+
+
+@triton.jit
 def _opened(
-    members, x, y, z, transforms, code_biases, shortcut_biases, matrices, vectors,
+    opening, x, y, z, matrices, vectors,
     PRECISION: tl.constexpr, IS_INTERPRETED: tl.constexpr,
 ):  # fmt: skip
-    """First layer and first block of one part: its code is a bias, its frame an affine map."""
-    row = transforms + 12 * members
-    hidden = tl.load(code_biases + members[:, None] * 128 + tl.arange(0, 128)[None, :])
-    out = tl.load(shortcut_biases + members[:, None] * 64 + tl.arange(0, 64)[None, :])
-    for axis in tl.static_range(3):
-        place = (
-            tl.load(row + 4 * axis) * x
-            + tl.load(row + 4 * axis + 1) * y
-            + tl.load(row + 4 * axis + 2) * z
-            + tl.load(row + 4 * axis + 3)
-        )
-        hidden += place[:, None] * _vector(vectors + 128 * axis, 128)
-        out += place[:, None] * _vector(vectors + 384 + 64 * axis, 64)
-    inner = _product(
-        tl.maximum(hidden, 0.0), _matrix(matrices, 128, 64), PRECISION, IS_INTERPRETED
-    ) + _vector(vectors + 576, 64)
-    outer = _product(
-        tl.maximum(inner, 0.0), _matrix(matrices + 8192, 64, 64), PRECISION, IS_INTERPRETED
-    ) + _vector(vectors + 640, 64)
-    return out + outer
+    """First layer and first block of one part: before the first ReLU all is affine."""
+    # In two halves: the whole layer would not fit into the registers.
+    left = tl.maximum(_affine(opening, x, y, z, 192, 64), 0.0)
+    inner = _product(left, _matrix(matrices, 64, 64), PRECISION, IS_INTERPRETED)
+    right = tl.maximum(_affine(opening + 64, x, y, z, 192, 64), 0.0)
+    inner += _product(right, _matrix(matrices + 4096, 64, 64), PRECISION, IS_INTERPRETED)
+    inner = tl.maximum(inner + _vector(vectors, 64), 0.0)
+    outer = _product(inner, _matrix(matrices + 8192, 64, 64), PRECISION, IS_INTERPRETED)
+    return outer + _affine(opening + 128, x, y, z, 192, 64)
 
 
 @triton.jit
@@ -141,27 +152,33 @@ def _own(values, hidden, out, matrices, PRECISION: tl.constexpr, IS_INTERPRETED:
     return out + _product(values, _matrix(matrices + 16384, 64, 64), PRECISION, IS_INTERPRETED)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["num_pairs"])
 def _trunk(
-    points, point_of, pair_of, pairs, transforms, code_biases, shortcut_biases,
-    matrices, vectors, tokens, count,
+    points, point_of, pair_ends, pairs, openings, matrices, vectors, tokens, num_pairs,
     BLOCK: tl.constexpr, PRECISION: tl.constexpr, IS_INTERPRETED: tl.constexpr,
 ):  # fmt: skip
-    item = (tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)).to(tl.int64)
-    is_item = item < count
+    tile = tl.program_id(0)
+    # Tiles are counted pair by pair; the last one of a pair may be filled in part.
+    pair, start, end, begun, before = 0, 0, 0, 0, 0
+    for number in range(num_pairs):
+        stop = tl.load(pair_ends + number)
+        tiles = tl.cdiv(stop - begun, BLOCK)
+        is_here = (tile >= before) & (tile < before + tiles)
+        pair = tl.where(is_here, number, pair)
+        start = tl.where(is_here, begun + (tile - before) * BLOCK, start)
+        end = tl.where(is_here, stop, end)
+        before += tiles
+        begun = stop
+    item = start + tl.arange(0, BLOCK)
+    is_item = item < end
     point = points + 3 * tl.load(point_of + item, mask=is_item, other=0)
     x, y, z = tl.load(point), tl.load(point + 1), tl.load(point + 2)
-    pair = pairs + 2 * tl.load(pair_of + item, mask=is_item, other=0)
-    first = _opened(
-        tl.load(pair), x, y, z,
-        transforms, code_biases, shortcut_biases, matrices, vectors, PRECISION, IS_INTERPRETED,
-    )  # fmt: skip
-    second = _opened(
-        tl.load(pair + 1), x, y, z,
-        transforms, code_biases, shortcut_biases, matrices, vectors, PRECISION, IS_INTERPRETED,
-    )  # fmt: skip
+    opening = openings + 768 * tl.load(pairs + 2 * pair)
+    first = _opened(opening, x, y, z, matrices, vectors, PRECISION, IS_INTERPRETED)
+    opening = openings + 768 * tl.load(pairs + 2 * pair + 1)
+    second = _opened(opening, x, y, z, matrices, vectors, PRECISION, IS_INTERPRETED)
     matrices += 12288
-    vectors += 704
+    vectors += 64
     for _ in tl.static_range(2):
         hidden, out = _common(
             tl.maximum(first, second), matrices, vectors, PRECISION, IS_INTERPRETED
@@ -170,16 +187,15 @@ def _trunk(
         second = _own(second, hidden, out, matrices, PRECISION, IS_INTERPRETED)
         matrices += 20480
         vectors += 128
-    place = tokens + 128 * item[:, None] + tl.arange(0, 64)[None, :]
+    place = tokens + 128 * item.to(tl.int64)[:, None] + tl.arange(0, 64)[None, :]
     tl.store(place, first.to(tokens.dtype.element_ty), mask=is_item[:, None])
     tl.store(place + 64, second.to(tokens.dtype.element_ty), mask=is_item[:, None])
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def _answers(
-    tokens, answers, point_of, pair_of, pairs, matrices, vectors, logits, best, winners, count,
-    IS_FUSED: tl.constexpr, BLOCK: tl.constexpr, PRECISION: tl.constexpr,
-    IS_INTERPRETED: tl.constexpr,
+    tokens, answers, point_of, pair_of, pairs, matrices, vectors, best, winners, count,
+    BLOCK: tl.constexpr, PRECISION: tl.constexpr, IS_INTERPRETED: tl.constexpr,
 ):  # fmt: skip
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     is_answer = index < count
@@ -211,24 +227,15 @@ def _answers(
     ) + _vector(vectors + 320, 128)
     logit = tl.sum(tl.maximum(fourth, 0.0) * _vector(vectors + 448, 128), axis=1)
     logit += tl.load(vectors + 576)
-    if IS_FUSED:
-        point = tl.load(point_of + item, mask=is_answer, other=0)
-        pair = tl.load(pair_of + item, mask=is_answer, other=0)
-        bone = tl.load(pairs + 2 * pair + side)
-        # Integers that are ordered like the numbers; the lower half of a key says who gave it.
-        bits = logit.to(tl.int32, bitcast=True)
-        ordered = bits ^ ((bits >> 31) & 0x7FFFFFFF)
-        key = (ordered.to(tl.int64) << 32) | (2 * pair + side).to(tl.int64)
-        tl.atomic_max(best + _NUM_BONES * point + bone, ordered, mask=is_answer, sem="relaxed")
-        tl.atomic_max(winners + point, key, mask=is_answer, sem="relaxed")
-    else:
-        tl.store(logits + index, logit, mask=is_answer)
-
-
-@triton.jit
-def _along(row, x, y, z):
-    """One coordinate in a part's frame."""
-    return tl.load(row) * x + tl.load(row + 1) * y + tl.load(row + 2) * z + tl.load(row + 3)
+    point = tl.load(point_of + item, mask=is_answer, other=0)
+    pair = tl.load(pair_of + item, mask=is_answer, other=0)
+    bone = tl.load(pairs + 2 * pair + side)
+    # Integers that are ordered like the numbers; the lower half of a key says who gave it.
+    bits = logit.to(tl.int32, bitcast=True)
+    ordered = bits ^ ((bits >> 31) & 0x7FFFFFFF)
+    key = (ordered.to(tl.int64) << 32) | (2 * pair + side).to(tl.int64)
+    tl.atomic_max(best + _NUM_BONES * point + bone, ordered, mask=is_answer, sem="relaxed")
+    tl.atomic_max(winners + point, key, mask=is_answer, sem="relaxed")
 
 
 @triton.jit
@@ -237,12 +244,12 @@ def _beyond(box, axis, place):
     return tl.maximum(tl.load(box + axis) - place, place - tl.load(box + 3 + axis))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def _boxes(
     points, transforms, boxes, cut, pairs, held_by, counts, count, margin,
     NUM_PAIRS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Which boxes hold a point (bits), and how many pairs and answers that makes."""
+    """Which boxes hold a point (bits); of each pair, items and answers there."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     is_point = index < count
     x = tl.load(points + 3 * index, mask=is_point, other=0.0)
@@ -262,40 +269,34 @@ def _boxes(
         place = _along(transforms + 4 * axis, x, y, z)
         height += (place - tl.load(cut + axis)) * tl.load(cut + 3 + axis)
     held = tl.where(height < 0, held, 0)
-    num_items = tl.zeros((BLOCK,), tl.int32)
-    num_answers = tl.zeros((BLOCK,), tl.int32)
+    tl.store(held_by + index, held, mask=is_point)
     for pair in tl.static_range(NUM_PAIRS):
         first = (held >> tl.load(pairs + 2 * pair)) & 1
         second = (held >> tl.load(pairs + 2 * pair + 1)) & 1
-        num_items += first | second
-        num_answers += first + second
-    tl.store(held_by + index, held, mask=is_point)
-    tl.store(counts + index, (num_items.to(tl.int64) << 32) | num_answers, mask=is_point)
+        both = ((first | second).to(tl.int64) << 32) | (first + second)
+        tl.store(counts + pair * count.to(tl.int64) + index, both, mask=is_point)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def _listed(
-    held_by, ends, counts, pairs, item_points, item_pairs, answers, count,
-    NUM_PAIRS: tl.constexpr, BLOCK: tl.constexpr,
+    held_by, ends, counts, pairs, item_points, item_pairs, answers, count, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Writes down what the counts have made room for."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    pair = tl.program_id(1)
     is_point = index < count
     held = tl.load(held_by + index, mask=is_point, other=0)
-    begin = tl.load(ends + index, mask=is_point, other=0)
-    begin -= tl.load(counts + index, mask=is_point, other=0)
+    place = pair * count.to(tl.int64) + index
+    begin = tl.load(ends + place, mask=is_point, other=0)
+    begin -= tl.load(counts + place, mask=is_point, other=0)
     item, answer = (begin >> 32).to(tl.int32), (begin & 0xFFFFFFFF).to(tl.int32)
-    for pair in tl.static_range(NUM_PAIRS):
-        first = (held >> tl.load(pairs + 2 * pair)) & 1
-        second = (held >> tl.load(pairs + 2 * pair + 1)) & 1
-        is_item = (first | second) > 0
-        tl.store(item_points + item, index, mask=is_item)
-        tl.store(item_pairs + item, tl.zeros((BLOCK,), tl.int32) + pair, mask=is_item)
-        tl.store(answers + answer, 2 * item, mask=first > 0)
-        answer += first
-        tl.store(answers + answer, 2 * item + 1, mask=second > 0)
-        answer += second
-        item += first | second
+    first = (held >> tl.load(pairs + 2 * pair)) & 1
+    second = (held >> tl.load(pairs + 2 * pair + 1)) & 1
+    is_item = (first | second) > 0
+    tl.store(item_points + item, index, mask=is_item)
+    tl.store(item_pairs + item, tl.zeros((BLOCK,), tl.int32) + pair, mask=is_item)
+    tl.store(answers + answer, 2 * item, mask=first > 0)
+    tl.store(answers + answer + first, 2 * item + 1, mask=second > 0)
 
 
 @triton.jit
@@ -304,7 +305,7 @@ def _number(ordered):
     return bits.to(tl.float32, bitcast=True)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["count"])
 def _values(
     points, transforms, boxes, best, winners, whole, soft, deciders, count,
     margin, softness, sharpness, BLOCK: tl.constexpr,
@@ -347,7 +348,6 @@ def pack_weights(
         logit_scale: what the logit is multiplied by.
     """
     width = pointnet.output.out_features
-    of_code, of_place = pointnet.input.weight.detach().split((width, 3), dim=1)
     opening, *between, last = cast(list[ResidualBlock], list(pointnet.blocks))
     trunk = [opening.inner.weight.T, opening.outer.weight.T]
     trunk += [part for block in between for part in _shared_first(block, width)]
@@ -356,19 +356,23 @@ def pack_weights(
     output, output_bias = pointnet.output.weight, pointnet.output.bias
     answers = [*_shared_first(last, width), (first.weight @ output).T]
     answers += [second.weight.T, joined.T, (from_features @ output).T, fourth.weight.T]
-    of_shortcut = opening.shortcut.weight.detach()
-    trunk_vectors = [length_scale * of_place.T, length_scale * (of_shortcut @ of_place).T]
-    for block in (opening, *between):
+    trunk_vectors: list[Tensor] = [opening.inner.bias]
+    for block in between:
         trunk_vectors += [block.inner.bias, block.outer.bias]
     vectors: list[Tensor] = [last.inner.bias, last.outer.bias]
     vectors += [first.bias + first.weight @ output_bias, second.bias]
     vectors += [third.bias + from_features @ output_bias, fourth.bias]
     vectors += [logit_scale * mlp.output.weight, logit_scale * mlp.output.bias]
+    opened, shortcut = pointnet.input, opening.shortcut.weight
+    affine = torch.cat([opened.weight, shortcut @ opened.weight]).detach()
+    scale = torch.ones_like(affine[0])
+    scale[width:] = length_scale
+    bias = torch.cat([opened.bias, shortcut @ opened.bias + opening.outer.bias]).detach()
     return PackedWeights(
         _flat(trunk + answers).to(torch.bfloat16 if precision == "bf16" else torch.float32),
         _flat(trunk_vectors + vectors),
-        of_code,
-        of_shortcut,
+        affine * scale,
+        bias,
         precision,
         sum(matrix.numel() for matrix in trunk),
         sum(vector.numel() for vector in trunk_vectors),
@@ -380,48 +384,46 @@ class PackedHand:
     """A posed hand as the kernels read it.
 
     Attributes:
-        code_biases: of the first layer, its own bias included.
-        shortcut_biases: the same past the first block.
+        openings: first layer and shortcut of each part as an affine map of the world's metres:
+            factors of x, y and z, and what is added.
         transforms: frames of the parts, upper three rows, metres.
         boxes: lower and upper corner of each part's own box, metres.
         cut: point and normal of the wrist's plane, in the wrist's frame.
         margin: how far boxes reach beyond the parts, metres.
     """
 
-    code_biases: Float[Tensor, "bones 128"]
-    shortcut_biases: Float[Tensor, "bones 64"]
+    openings: Float[Tensor, "bones 4 192"]
     transforms: Float[Tensor, "bones 3 4"]
     boxes: Float[Tensor, "bones 6"]
     cut: Float[Tensor, "6"]
     margin: float
 
 
+@torch.no_grad()
 def pack_hand(
-    weights: PackedWeights,
-    first_bias: Float[Tensor, "128"],
-    part_codes: Float[Tensor, "bones 64"],
-    boxes: PartBoxes,
+    weights: PackedWeights, part_codes: Float[Tensor, "bones 64"], boxes: PartBoxes
 ) -> PackedHand:
     """What a pose adds to the weights.
 
     Args:
         weights: of the decoder.
-        first_bias: of its first layer.
         part_codes: encodings of the parts.
         boxes: of the parts.
     """
-    code_biases = part_codes @ weights.of_code.T + first_bias
+    of_code, of_place = weights.first.split((part_codes.shape[-1], 3), dim=1)
+    transforms = boxes.bone_from_world[:, :3].contiguous()
+    openings = (of_place @ transforms).mT
+    openings[:, 3] += part_codes @ of_code.T + weights.first_bias
     return PackedHand(
-        code_biases.detach().contiguous(),
-        (code_biases @ weights.shortcut.T).detach().contiguous(),
-        boxes.bone_from_world[:, :3].detach().contiguous(),
+        openings.contiguous(),
+        transforms,
         torch.cat([boxes.lower, boxes.upper], dim=-1),
         torch.cat([boxes.cut_point, boxes.cut_normal]),
         boxes.margin,
     )
 
 
-def fused_logits(
+def largest_logits(
     weights: PackedWeights,
     hand: PackedHand,
     pairs: Int[Tensor, "pairs 2"],
@@ -429,13 +431,13 @@ def fused_logits(
     item_points: Int[Tensor, "items"],
     item_pairs: Int[Tensor, "items"],
     is_wanted: Bool[Tensor, "items 2"],
-) -> Float[Tensor, "wanted"]:
-    """Logits of the wanted answers, without gradient.
+) -> Float[Tensor, "points"]:
+    """The largest of the wanted answers at each point, without gradient; minus infinity if none.
 
     Args:
         weights: packed; with ``tf32`` or ``bf16`` for looking, not for what must be exact.
         hand: packed.
-        pairs: the two parts of each pair.
+        pairs: the two parts of each pair, 32-bit.
         points: in the world, metres.
         item_points: the point of each item.
         item_pairs: its pair.
@@ -443,10 +445,15 @@ def fused_logits(
 
     Source: paper Sec. 3.2 and appendix (local-pair decoder).
     """
-    answers = is_wanted.flatten().nonzero()[:, 0]
-    logits = points.new_empty(len(answers))
-    _decode(weights, hand, pairs, points, (item_points, item_pairs, answers), logits=logits)
-    return logits
+    item_pairs, order = item_pairs.int().sort()
+    pair_ends = torch.bincount(item_pairs, minlength=len(pairs)).cumsum(0).int()
+    answers = is_wanted[order].flatten().nonzero()[:, 0].int()
+    best, winners = _nobody(points, len(hand.transforms))
+    items = _Items(item_points[order].int(), item_pairs, answers, pair_ends)
+    _decode(weights, hand, pairs, points, items, pair_ends.tolist(), best, winners)
+    ordered = (winners >> 32).int()
+    bits = ordered ^ ((ordered >> 31) & 0x7FFFFFFF)
+    return torch.where(winners > _NOBODY, bits.view(torch.float32), -torch.inf)
 
 
 def fused_occupancy(
@@ -462,7 +469,7 @@ def fused_occupancy(
     Args:
         weights: packed.
         hand: packed.
-        pairs: the two parts of each pair.
+        pairs: the two parts of each pair, 32-bit.
         points: in the world, metres.
         softness: the paper's tau.
         sharpness: what the logit of the whole is multiplied by.
@@ -480,32 +487,61 @@ def fused_occupancy(
     deciders = torch.empty(count, dtype=torch.int32, device=points.device)
     if count == 0:
         return whole, soft, deciders
-    grid = (triton.cdiv(count, _POINTS),)
+    blocks = triton.cdiv(count, _POINTS)
     held_by = torch.empty_like(deciders)
-    counts = torch.empty(count, dtype=torch.int64, device=points.device)
-    _boxes[grid](
+    # Items in the upper half, answers in the lower one.
+    counts = torch.empty(num_pairs, count, dtype=torch.int64, device=points.device)
+    _boxes[(blocks,)](
         points, hand.transforms, hand.boxes, hand.cut, pairs, held_by, counts, count, hand.margin,
         NUM_PAIRS=num_pairs, BLOCK=_POINTS,
     )  # fmt: skip
-    ends = counts.cumsum(0)
-    total = int(ends[-1])
-    num_items, num_answers = total >> 32, total & 0xFFFFFFFF
-    item_points, item_pairs = deciders.new_empty(2, num_items)
-    answers = deciders.new_empty(num_answers)
-    best = torch.full_like(soft, _NOBODY[torch.int32], dtype=torch.int32)
-    winners = torch.full_like(counts, _NOBODY[torch.int64])
-    if num_items:
-        _listed[grid](
-            held_by, ends, counts, pairs, item_points, item_pairs, answers, count,
-            NUM_PAIRS=num_pairs, BLOCK=_POINTS,
+    ends = counts.flatten().cumsum(0)
+    pair_ends = ends[count - 1 :: count]
+    found = pair_ends.tolist()
+    best, winners = _nobody(points, num_bones)
+    if found[-1]:
+        num_items, num_answers = found[-1] >> 32, found[-1] & 0xFFFFFFFF
+        item_points, item_pairs = deciders.new_empty(num_items), deciders.new_empty(num_items)
+        answers = deciders.new_empty(num_answers)
+        _listed[(blocks, num_pairs)](
+            held_by, ends, counts, pairs, item_points, item_pairs, answers, count, BLOCK=_POINTS,
         )  # fmt: skip
-        items = item_points, item_pairs, answers
-        _decode(weights, hand, pairs, points, items, best=best, winners=winners)
-    _values[grid](
+        items = _Items(item_points, item_pairs, answers, (pair_ends >> 32).int())
+        ends_here = [end >> 32 for end in found]
+        _decode(weights, hand, pairs, points, items, ends_here, best, winners)
+    _values[(blocks,)](
         points, hand.transforms, hand.boxes, best, winners, whole, soft, deciders, count,
         hand.margin, softness, sharpness, BLOCK=_POINTS,
     )  # fmt: skip
     return whole, soft, deciders
+
+
+def _nobody(
+    points: Float[Tensor, "points 3"], num_bones: int
+) -> tuple[Int[Tensor, "points bones"], Int[Tensor, "points"]]:
+    """Where the largest answers are to be noted: of each part, and of all."""
+    size, device = (len(points), num_bones), points.device
+    return (
+        torch.full(size, _NOBODY >> 32, dtype=torch.int32, device=device),
+        torch.full(size[:1], _NOBODY, dtype=torch.int64, device=device),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Items:
+    """What is to be decoded, pair by pair; 32-bit.
+
+    Attributes:
+        points: the point of each item.
+        pairs: its pair.
+        answers: twice the number of an item, plus one for the second part.
+        pair_ends: where each pair's items end.
+    """
+
+    points: Int[Tensor, "items"]
+    pairs: Int[Tensor, "items"]
+    answers: Int[Tensor, "answers"]
+    pair_ends: Int[Tensor, "pairs"]
 
 
 def _decode(
@@ -513,13 +549,12 @@ def _decode(
     hand: PackedHand,
     pairs: Int[Tensor, "pairs 2"],
     points: Float[Tensor, "points 3"],
-    items: tuple[Int[Tensor, "items"], Int[Tensor, "items"], Int[Tensor, "answers"]],
-    logits: Float[Tensor, "answers"] | None = None,
-    best: Int[Tensor, "points bones"] | None = None,
-    winners: Int[Tensor, "points"] | None = None,
+    items: _Items,
+    pair_ends: list[int],
+    best: Int[Tensor, "points bones"],
+    winners: Int[Tensor, "points"],
 ) -> None:
-    """Trunk and answers; into ``logits``, or the largest into ``best`` and ``winners``."""
-    item_points, item_pairs, answers = (part.contiguous() for part in items)
+    """Trunk and answers; notes the largest in ``best`` and ``winners``."""
     block, warps = _LAUNCHES[weights.precision]
     constants: dict[str, Any] = {
         "num_warps": warps,
@@ -528,36 +563,33 @@ def _decode(
         "IS_INTERPRETED": _IS_INTERPRETED,
     }
     token_type = torch.bfloat16 if weights.precision == "bf16" else torch.float32
-    tokens = points.new_empty(len(item_points), 2, 64, dtype=token_type)
-    if len(item_points):
-        _trunk[(triton.cdiv(len(item_points), block),)](
+    tokens = points.new_empty(len(items.points), 2, 64, dtype=token_type)
+    tiles = sum(triton.cdiv(end - begin, block) for begin, end in pairwise([0, *pair_ends]))
+    if tiles:
+        _trunk[(tiles,)](
             points.detach().contiguous(),
-            item_points,
-            item_pairs,
+            items.points,
+            items.pair_ends,
             pairs,
-            hand.transforms,
-            hand.code_biases,
-            hand.shortcut_biases,
+            hand.openings,
             weights.matrices,
             weights.vectors,
             tokens,
-            len(item_points),
+            len(pairs),
             **constants,
         )
-    if len(answers):
-        _answers[(triton.cdiv(len(answers), block),)](
+    if len(items.answers):
+        _answers[(triton.cdiv(len(items.answers), block),)](
             tokens,
-            answers,
-            item_points,
-            item_pairs,
+            items.answers,
+            items.points,
+            items.pairs,
             pairs,
             weights.matrices[weights.num_trunk_matrices :],
             weights.vectors[weights.num_trunk_vectors :],
-            logits,
             best,
             winners,
-            len(answers),
-            IS_FUSED=logits is None,
+            len(items.answers),
             **constants,
         )
 

@@ -6,11 +6,11 @@ import triton.language as tl
 from jaxtyping import Float, Int
 from torch import Tensor
 
-_QUERIES = 64
+_QUERIES = 32
 """At a time in one program."""
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["num_queries", "num_anchors"])
 def _nearest(
     anchors, queries, found, num_queries, num_anchors,
     BLOCK: tl.constexpr, ANCHORS: tl.constexpr,

@@ -305,12 +305,11 @@ class PairOccupancy(nn.Module):
             codes: of the posed hand.
             points: world, metres.
             items: of these points.
-            kernel: any but ``torch`` gives no gradient; factors have 32 bits with all of them.
+            kernel: any but ``torch`` gives no gradient; factors are long with all of them.
         """
-        if kernel == "torch":
-            logits = self.wanted_logits(codes, points, items)
-        else:
-            logits = self._fused_logits(codes, points, items, PRECISIONS["triton"])
+        if kernel != "torch" and isinstance(self.fusion, MaximumFusion):
+            return soft_occupancy(self._largest_logits(codes, points, items), self.sharpness)
+        logits = self.wanted_logits(codes, points, items)
         slots = (items.points[:, None] * NUM_BONES + self.pairs[items.pairs])[items.is_wanted]
         parts = self.fusion.over_pairs(logits, slots, len(points) * NUM_BONES, slope=self.sharpness)
         return self.fusion.over_parts(parts.view(-1, NUM_BONES))
@@ -402,11 +401,7 @@ class PairOccupancy(nn.Module):
         is_wanted = is_in_box[point_index[:, None], members]
         items = PairItems(point_index, pair_index, is_wanted)
         item_of_answer, side = is_wanted.nonzero().unbind(-1)
-        if kernel == "torch":
-            logits = self._item_logits(codes, local, items)
-        else:
-            logits = self._fused_logits(codes, points, items, PRECISIONS[kernel])
-
+        logits = self._item_logits(codes, local, items)
         answer_points = point_index[item_of_answer]
         slots = answer_points * NUM_BONES + members[is_wanted]
         size = num_points * NUM_BONES
@@ -435,20 +430,15 @@ class PairOccupancy(nn.Module):
         features, row_of = self._part_features(codes, local, is_needed)
         return self._answers(features[row_of[members, items.points[:, None]]], items.is_wanted)
 
-    def _fused_logits(
-        self,
-        codes: HandCodes,
-        points: Float[Tensor, "points 3"],
-        items: PairItems,
-        precision: Precision,
-    ) -> Float[Tensor, "wanted"]:
-        """The same by the kernels of :mod:`handavatar.field.fused`."""
-        from handavatar.field.fused import fused_logits
+    def _largest_logits(
+        self, codes: HandCodes, points: Float[Tensor, "points 3"], items: PairItems
+    ) -> Float[Tensor, "points"]:
+        """The largest logit of each point's items, by :mod:`handavatar.field.fused`."""
+        from handavatar.field.fused import largest_logits
 
-        weights, hand = self._packed_for(codes, precision)
-        pairs = self.pairs.int()
-        return fused_logits(
-            weights, hand, pairs, points, items.points, items.pairs, items.is_wanted
+        weights, hand = self._packed_for(codes, PRECISIONS["triton"])
+        return largest_logits(
+            weights, hand, self.pairs.int(), points, items.points, items.pairs, items.is_wanted
         )
 
     def _fused_occupancy(
@@ -481,7 +471,7 @@ class PairOccupancy(nn.Module):
         weights = self._packed[precision][1]
         known = self._hands.get(codes)
         if known is None or known[0] is not weights:
-            hand = pack_hand(weights, network.input.bias, codes.part_codes, codes.boxes)
+            hand = pack_hand(weights, codes.part_codes, codes.boxes)
             known = self._hands[codes] = weights, hand
         return known
 
