@@ -49,7 +49,7 @@ MAY_IMPORT = {
 # Heavy or optional packages that a function may import when it needs them.
 OPTIONAL_EXTRAS = {"mediapipe", "cv2", "mitsuba", "drjit"}
 # Modules that import such a package (triton) at their top.
-OPTIONAL_MODULES = {"handavatar.field.fused"}
+OPTIONAL_MODULES = {"handavatar.field.fused", "handavatar.field.fused_anchors"}
 FORBIDDEN_NAMES = {"utils", "util", "misc", "helpers", "common", "base", "manager"}
 
 

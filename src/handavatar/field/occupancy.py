@@ -489,15 +489,15 @@ class PairOccupancy(nn.Module):
         row_of = needed.flatten().cumsum(0).view_as(needed) - 1
         if local.device.type != "cpu":
             # A GPU spends more on each operation's start than on moving the biases.
-            bone, point = needed.nonzero().unbind(-1)
-            opened = biases[bone] + local[point, bone] @ position_weight
+            bones, inside = needed.nonzero().unbind(-1)
+            opened = biases[bones] + local[inside, bones] @ position_weight
             return self.decoder.pointnet.blocks[0](opened), row_of
         counts = needed.sum(-1).tolist()
         features = local.new_empty(sum(counts), layer.out_features)
         start = 0
         for bone, count in enumerate(counts):
-            inside = local[:, bone][needed[bone]]
-            torch.addmm(biases[bone], inside, position_weight, out=features[start : start + count])
+            held = local[:, bone][needed[bone]]
+            torch.addmm(biases[bone], held, position_weight, out=features[start : start + count])
             start += count
         return self.decoder.pointnet.blocks[0](features), row_of
 
