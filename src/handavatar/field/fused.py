@@ -33,12 +33,8 @@ from handavatar.field.layers import PointNet, ResidualBlock, SkipMLP
 from handavatar.hand.parts import PartBoxes
 from handavatar.hand.pose import NUM_BONES
 
-_LAUNCHES: dict[Precision, tuple[int, int]] = {
-    "tf32x3": (128, 8),
-    "tf32": (128, 8),
-    "bf16": (128, 8),
-}
-"""Items at a time in one program, and its warps."""
+_BLOCK, _WARPS = 128, 8
+"""Items at a time in one program of the decoder, and its warps."""
 _POINTS = 128
 """Points at a time in one program."""
 _NUM_BONES: tl.constexpr = tl.constexpr(NUM_BONES)
@@ -555,16 +551,15 @@ def _decode(
     winners: Int[Tensor, "points"],
 ) -> None:
     """Trunk and answers; notes the largest in ``best`` and ``winners``."""
-    block, warps = _LAUNCHES[weights.precision]
     constants: dict[str, Any] = {
-        "num_warps": warps,
-        "BLOCK": block,
+        "num_warps": _WARPS,
+        "BLOCK": _BLOCK,
         "PRECISION": weights.precision,
         "IS_INTERPRETED": _IS_INTERPRETED,
     }
     token_type = torch.bfloat16 if weights.precision == "bf16" else torch.float32
     tokens = points.new_empty(len(items.points), 2, 64, dtype=token_type)
-    tiles = sum(triton.cdiv(end - begin, block) for begin, end in pairwise([0, *pair_ends]))
+    tiles = sum(triton.cdiv(end - begin, _BLOCK) for begin, end in pairwise([0, *pair_ends]))
     if tiles:
         _trunk[(tiles,)](
             points.detach().contiguous(),
@@ -579,7 +574,7 @@ def _decode(
             **constants,
         )
     if len(items.answers):
-        _answers[(triton.cdiv(len(items.answers), block),)](
+        _answers[(triton.cdiv(len(items.answers), _BLOCK),)](
             tokens,
             items.answers,
             items.points,
