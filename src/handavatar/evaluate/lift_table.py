@@ -35,7 +35,7 @@ class LiftTableOptions:
 
     Attributes:
         capture: a made capture.
-        avatars: run folders or avatar files of its subject, comma-separated.
+        avatars: run folders or avatar files of its subject, one after the other.
         lift: fingers or bones, comma-separated; several with ``+`` are lifted together.
         frames: of the test split, evenly spread.
         samples: light paths per pixel of the truth.

@@ -34,7 +34,7 @@ class PeersTableOptions:
     """What is compared.
 
     Attributes:
-        captures: folders of captures whose poses are known, comma-separated.
+        captures: folders of captures whose poses are known, one after the other.
         kept: folder; what was reached on a capture is kept there as ``peers-CAPTURE.json`` and is
             not measured again with the same steps and seeds.
         seeds: of all trainings; geometry is fitted once per capture.

@@ -20,7 +20,7 @@ class AblationTableOptions:
     """What is compared, and where the figures of every frame are kept.
 
     Attributes:
-        captures: folders of captures, comma-separated: made ones (``handavatar capture
+        captures: folders of captures, one after the other: made ones (``handavatar capture
             benchmark``), or any, whose split into albedo and light then is not judged.
         kept: folder; what a capture's rows reached is kept there as ``CAPTURE.json`` and is not
             measured again with the same steps and seeds; ``CAPTURE.png`` shows three test frames
