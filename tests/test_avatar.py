@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -16,6 +17,7 @@ from handavatar.avatar import (
     SCHEMA,
     CheckpointError,
     HandAvatar,
+    HandState,
     Rendering,
     RenderSettings,
 )
@@ -97,6 +99,28 @@ def test_a_batch_is_rendered_as_its_hands_are_one_by_one(small_avatar: HandAvata
         assert torch.equal(picture.color, small_avatar.render(pose, camera).color)
     with pytest.raises(ValueError, match="3 poses and 2 cameras"):
         small_avatar.render_batch(poses, cameras[:2])
+
+
+def test_in_a_batch_a_pose_is_prepared_once(
+    small_avatar: HandAvatar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared: list[HandPose] = []
+    prepare = HandAvatar.prepare
+
+    def counted(self: HandAvatar, pose: HandPose, *rest: Any) -> HandState:
+        prepared.append(pose)
+        return prepare(self, pose, *rest)
+
+    poses = [bent_pose(1), bent_pose(2)]
+    cameras = [camera_above(12), camera_above(16)]
+    edit = Edit(light_gain=1.2, lifted_bones=(13, 14, 15))
+    alone = [small_avatar.render(pose, camera, edit) for camera in cameras for pose in poses]
+    monkeypatch.setattr(HandAvatar, "prepare", counted)
+    found = small_avatar.render_batch(2 * poses, [cameras[n // 2] for n in range(4)], edit)
+    assert len(prepared) == 2
+    for picture, expected in zip(found, alone, strict=True):
+        assert torch.equal(picture.color, expected.color)
+    assert small_avatar.render_batch([], []) == []
 
 
 def test_at_the_outline_a_pixel_is_the_mean_of_four_rays(

@@ -524,8 +524,12 @@ class HandAvatar(nn.Module):
 
         Departs: the authors send one ray through every pixel, and the outline is jagged.
         """
-        settings = settings or RenderSettings()
         state = self.prepare(pose.to(self.device), edit.lifted_bones if edit else ())
+        return self._picture(state, camera, edit, settings or RenderSettings())
+
+    def _picture(
+        self, state: HandState, camera: Camera, edit: Edit | None, settings: RenderSettings
+    ) -> Rendering:
         camera = camera.to(self.device)
         near = self.near_mesh(state, camera, settings.mask_margin).flatten().nonzero()[:, 0]
         centers = pixel_centers(camera).flatten(0, 1)
@@ -557,6 +561,8 @@ class HandAvatar(nn.Module):
     ) -> list[Rendering]:
         """The pictures that :meth:`render` makes one by one; on a CPU side by side, a thread each.
 
+        What the pictures of a pose share is done once, if it is the same object every time.
+
         Raises:
             ValueError: if there are not as many cameras as poses.
         """
@@ -565,8 +571,15 @@ class HandAvatar(nn.Module):
                 f"render_batch: found {len(poses)} poses and {len(cameras)} cameras, expected as "
                 "many of both"
             )
-        views = zip(poses, cameras, strict=True)
-        return mapped(lambda view: self.render(*view, edit, settings), views)
+        lifted_bones = edit.lifted_bones if edit else ()
+        settings = settings or RenderSettings()
+        states = mapped(
+            lambda pose: self.prepare(pose.to(self.device), lifted_bones),
+            {id(pose): pose for pose in poses}.values(),
+        )
+        state_of = dict(zip(dict.fromkeys(map(id, poses)), states, strict=True))
+        views = [(state_of[id(pose)], camera) for pose, camera in zip(poses, cameras, strict=True)]
+        return mapped(lambda view: self._picture(*view, edit, settings), views)
 
     def at_pixels(
         self,

@@ -17,14 +17,12 @@ from urllib.parse import parse_qs, urlsplit
 
 from handavatar.view.guard import PICTURE_KIND, Guard, Refused, kind_expected
 from handavatar.view.scene import SceneError
-from handavatar.view.studio import Interrupted
+from handavatar.view.studio import MOST_PICTURE_BYTES, Interrupted
 from handavatar.view.turns import Busy, Overtaken
 
 MOST_BYTES = 64 * 1024
 """Of a request's body."""
 MOST_CONNECTIONS = 160
-MOST_PICTURE_BYTES = 4 * 2**20
-"""Of a picture that is sent."""
 MOST_PICTURES = 2
 """Pictures that are being received or read at a time; more are asked to try again."""
 MOST_PORTS = 20

@@ -62,6 +62,8 @@ FLUID_SIZE = 256
 """The fluid picture has at most so many pixels along a side."""
 MOST_SAVED = 100
 Pixels = UInt8[np.ndarray, "size size 3"]
+MOST_PICTURE_BYTES = 4 * 2**20
+"""Of a picture that is sent as paint."""
 MOST_PICTURE_PIXELS = 4096 * 4096
 """Of a picture that is sent as paint; decoded it takes four bytes a pixel."""
 _KEPT_PAINTS = 8
@@ -151,6 +153,7 @@ class Studio:
             "layers": list(LAYERS),
             "sizes": list(SIZES),
             "stages": list(STAGES),
+            "most_picture_bytes": MOST_PICTURE_BYTES,
             "joints": joints,
             "fingers": list(FINGER_BONES),
             "angles": self.angles(None),
