@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -48,15 +49,20 @@ class _Seen:
 
     Attributes:
         avatar: read only.
-        baked: the same, of another module: pictures of both are made at once.
+        twin: the same, a module of its own: the other's evaluations can be interrupted.
         version: of the file.
         poses: rotations and translations of all training frames; None as the capture has them.
     """
 
     avatar: HandAvatar
-    baked: BakedAvatar
+    twin: HandAvatar
     version: int
     poses: tuple[torch.Tensor, torch.Tensor] | None
+
+    @cached_property
+    def baked(self) -> BakedAvatar:
+        """For one thread."""
+        return BakedAvatar(self.twin, start_of(self.twin.info.get("view")))
 
 
 class Watch:
@@ -163,8 +169,7 @@ class Watch:
         seen = self._newest()
         shot = self._shot(seen, view)
         if view.layer == "mesh":
-            vertices = seen.baked.posed(shot.pose).posed.vertices
-            return mesh_picture(vertices, seen.avatar, shot, 1)
+            return mesh_picture(posed_vertices(seen.twin, shot), seen.twin, shot, 1)
         rendering = seen.baked.render(shot.pose, shot.camera, shot.edit)
         return pass_pictures(rendering, self._side)[view.layer]
 
@@ -226,10 +231,10 @@ class Watch:
             return
         if self._seen is not None and self._seen.version == version:
             return
-        avatar = HandAvatar.load(live_avatar(self._run))
-        # A module of its own: the other one's evaluations can be interrupted.
-        baked = BakedAvatar(copy.deepcopy(avatar), start_of(avatar.info.get("view")))
-        self._seen = _Seen(avatar, baked, version, live_poses(avatar))
+        path = live_avatar(self._run)
+        before = self._seen
+        avatar = HandAvatar.load(path) if before is None else before.avatar.reloaded(path)
+        self._seen = _Seen(avatar, copy.deepcopy(avatar), version, live_poses(avatar))
 
 
 class _Curves:
@@ -287,26 +292,28 @@ class _Curve:
 
     def __init__(self) -> None:
         self._width = 1
-        self._bins: dict[int, tuple[float, int]] = {}
+        self._bins: dict[int, list[float]] = {}
 
     def add(self, step: int, value: float) -> None:
         """One more value."""
         while step // self._width >= MOST_POINTS:
             self._width *= 2
-            merged: dict[int, tuple[float, int]] = {}
-            for number, (total, count) in self._bins.items():
-                before = merged.get(number // 2, (0.0, 0))
-                merged[number // 2] = (before[0] + total, before[1] + count)
-            self._bins = merged
-        total, count = self._bins.get(step // self._width, (0.0, 0))
-        self._bins[step // self._width] = (total + value, count + 1)
+            halved = list(self._bins.items())
+            self._bins = {}
+            for number, sums in halved:
+                self._add(number // 2, sums)
+        self._add(step // self._width, [1, step, value])
 
     def points(self) -> list[list[float]]:
-        """Pairs of step and mean."""
+        """Pairs of step and value, the means of each bin."""
         return [
-            [number * self._width + (self._width - 1) / 2, float(f"{total / count:.5g}")]
-            for number, (total, count) in sorted(self._bins.items())
+            [round(steps / count, 1), float(f"{total / count:.5g}")]
+            for _, (count, steps, total) in sorted(self._bins.items())
         ]
+
+    def _add(self, number: int, sums: list[float]) -> None:
+        before = self._bins.get(number, [0, 0, 0])
+        self._bins[number] = [a + b for a, b in zip(before, sums, strict=True)]
 
 
 def _square(frame: Frame) -> tuple[float, float, float]:

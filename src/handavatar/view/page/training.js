@@ -13,7 +13,8 @@ let about = null;
 let order = 0;          // of the newest wish
 let waiting = null;     // ends the wait of the loop below
 let refining = null;    // aborts a picture that is no longer wanted
-const view = { frame: 0, layer: "rgb", size: 256 };
+let hasChosenLayer = false;
+const view = { frame: 0, layer: "mesh", size: 256 };
 
 const sleep = (milliseconds) => new Promise((wake) => setTimeout(wake, milliseconds));
 
@@ -105,6 +106,8 @@ async function follow() {
       about = await (await ask("training")).json();
       showProgress();
       if (about.phase !== "waiting") showFrames();
+      // Colours are learned last; until then the shape is what there is to see.
+      if (about.avatar && !hasChosenLayer) setLayer(about.avatar_job === "train" ? "rgb" : "mesh");
       if (about.frames && (order === 0 || about.avatar !== before)) renewed();
       tell("");
     } catch (error) {
@@ -124,6 +127,11 @@ async function draw(canvas, answer) {
   pen.drawImage(bitmap, 0, 0, canvas.width, canvas.height);
   bitmap.close();
   return true;
+}
+
+function setLayer(layer) {
+  view.layer = layer;
+  document.querySelector(`input[name=layer][value=${layer}]`).checked = true;
 }
 
 // A newer avatar: what is being made is finished first.
@@ -232,9 +240,9 @@ async function drawCurves() {
 
 for (const layer of LAYERS) {
   const line = Object.assign(document.createElement("label"), { className: "tick" });
-  const input = Object.assign(document.createElement("input"), { type: "radio", name: "layer", value: layer, checked: layer === "rgb" });
+  const input = Object.assign(document.createElement("input"), { type: "radio", name: "layer", value: layer, checked: layer === view.layer });
   line.append(input, layer);
-  input.addEventListener("change", () => { view.layer = layer; chosen(); });
+  input.addEventListener("change", () => { hasChosenLayer = true; view.layer = layer; chosen(); });
   $("layers").append(line);
 }
 $("number").addEventListener("input", chosen);
