@@ -74,8 +74,8 @@ def main() -> None:
         )
         page: Any = browser.new_page(viewport={"width": 1200, "height": 800})
         try:
-            page.goto(f"http://127.0.0.1:{options.port}/")
-            page.wait_for_selector("#picture[data-stage='1']", timeout=300_000)
+            page.goto(f"http://127.0.0.1:{options.port}/", timeout=300_000)
+            page.wait_for_selector("#picture[data-stage]", timeout=300_000)
             for _ in range(options.pairs):
                 for name in ("without", "with"):
                     os.kill(page_of, signal.SIGSTOP if name == "without" else signal.SIGCONT)

@@ -118,22 +118,22 @@ def test_how_far_it_is(trainer: Trainer) -> None:
     trainer.step(8, loss=0.4, psnr=21.0)
     about = trainer.watch.about()
     assert about["avatar"] is not None
-    assert (about["avatar_job"], about["avatar_step"]) == ("train", 8)
+    assert trainer.watch.fluid(View(0, "mesh", 64)).label == "train 8"
     json.dumps(about)
 
 
-def test_the_avatar_is_taken_anew_only_while_a_page_asks(trainer: Trainer) -> None:
+def test_the_avatar_is_left_anew_only_while_a_page_asks(
+    trainer: Trainer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     trainer.step(1)
     trainer.step(2)
     before = trainer.watch.about()["avatar"]
-    trainer.progress.update(3)
-    trainer.watch.refresh()
-    first = trainer.watch.about()["avatar"]
+    trainer.step(3)
+    assert trainer.watch.about()["avatar"] != before
+    monkeypatch.setattr(live, "_PATIENCE", 0.0)
+    before = trainer.watch.about()["avatar"]
     trainer.progress.update(4)
-    time.sleep(0.01)
-    trainer.watch._is_asked = False
-    trainer.watch.refresh()
-    assert trainer.watch.about()["avatar"] == first != before
+    assert trainer.watch.about()["avatar"] == before
 
 
 @pytest.mark.parametrize("trainer", ["right", "left"], indirect=True)
@@ -145,9 +145,9 @@ def test_a_frame_and_the_avatar_in_its_pose_cover_each_other(trainer: Trainer) -
         view = View(number, "mesh", 64)
         frame = trainer.watch.picture(view)
         hand = frame.max(-1) > 25
-        mesh = (trainer.watch.fluid(view) < 250).any(-1)
+        mesh = (trainer.watch.fluid(view).pixels < 250).any(-1)
         assert (hand & mesh).sum() / (hand | mesh).sum() > 0.75
-        color = trainer.watch.refined(View(number, "rgb", 64), "full", never)
+        color = trainer.watch.refined(View(number, "rgb", 64), "full", never).pixels
         field = color.max(-1) > 25
         assert (hand & field).sum() / (hand | field).sum() > 0.75
         # Its shape is a random one. The hand lies in the middle, with room around.
@@ -155,7 +155,7 @@ def test_a_frame_and_the_avatar_in_its_pose_cover_each_other(trainer: Trainer) -
         rows, columns = hand.nonzero()
         assert max(np.ptp(rows), np.ptp(columns)) == pytest.approx(64 / 1.25, abs=4)
         seen.append(frame.tobytes())
-        half = trainer.watch.refined(View(number, "rgb", 64), "half", never)
+        half = trainer.watch.refined(View(number, "rgb", 64), "half", never).pixels
         assert half.shape == (32, 32, 3)
     assert len(set(seen)) == 3
 
@@ -164,11 +164,11 @@ def test_a_left_hand_is_mirrored_back(trainer: Trainer) -> None:
     trainer.step(1)
     trainer.step(2)
     view = View(0, "rgb", 64)
-    right = [trainer.watch.picture(view), trainer.watch.fluid(view)]
+    right = [trainer.watch.picture(view), trainer.watch.fluid(view).pixels]
     capture = trainer.watch._capture
     assert capture is not None
     object.__setattr__(capture, "side", "left")
-    left = [trainer.watch.picture(view), trainer.watch.fluid(view)]
+    left = [trainer.watch.picture(view), trainer.watch.fluid(view).pixels]
     for one, other in zip(right, left, strict=True):
         assert np.array_equal(one[:, ::-1], other)
 
@@ -177,12 +177,12 @@ def test_the_picture_changes_with_the_avatar(trainer: Trainer) -> None:
     trainer.step(1)
     trainer.step(2)
     view = View(1, "albedo", 64)
-    before = trainer.watch.fluid(view)
+    before = trainer.watch.fluid(view).pixels
     with torch.no_grad():
         trainer.avatar.albedo.mlp.output.bias.add_(torch.tensor([2.0, 0.0, -2.0]))
     time.sleep(0.01)
     trainer.step(3)
-    after = trainer.watch.fluid(view)
+    after = trainer.watch.fluid(view).pixels
     assert after[..., 0].sum() > 1.2 * before[..., 0].sum()
     fresh = HandAvatar.load(live.live_avatar(trainer.run))
     seen = trainer.watch._seen
@@ -256,14 +256,14 @@ def test_what_an_earlier_trainer_left_is_not_news(trainer: Trainer) -> None:
 def test_a_damaged_avatar_is_an_error_that_the_next_one_mends(trainer: Trainer) -> None:
     trainer.step(1)
     trainer.step(2)
-    seen = trainer.watch._seen
+    view = View(0, "mesh", 64)
+    assert trainer.watch.fluid(view).label == "train 2"
     live.live_avatar(trainer.run).unlink()  # It is mapped into memory.
     live.live_avatar(trainer.run).write_bytes(b"half")
     with pytest.raises(ValueError, match="damaged"):
-        trainer.look()
-    assert trainer.watch._seen is seen
+        trainer.watch.fluid(view)
     trainer.step(3)
-    assert trainer.watch.about()["avatar_step"] == 3
+    assert trainer.watch.fluid(view).label == "train 3"
 
 
 # --- the server -----------------------------------------------------------------------------------
@@ -397,7 +397,9 @@ def test_a_page_that_dies_is_said_and_ends_nothing(
         _until(lambda: has_said("open http://127.0.0.1:"))
         port = int("".join(said).split("127.0.0.1:")[1].split("/")[0])
         assert json.loads(ask(port, "/training")[1])["phase"] == "waiting"
-        assert os.getpriority(os.PRIO_PROCESS, page._process.pid or 0) == 19
+        lanes = Path(f"/proc/{page._process.pid}/task").iterdir()
+        priorities = [os.getpriority(os.PRIO_PROCESS, int(lane.name)) for lane in lanes]
+        assert priorities.count(17) == 2
         os.kill(page._process.pid or 0, signal.SIGKILL)
         _until(lambda: has_said("the page has ended (exit code -9)"))
         page.stay()  # There is nothing to wait for.

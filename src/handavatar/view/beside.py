@@ -16,6 +16,8 @@ from handavatar.view.studio import Studio
 from handavatar.view.training import Watch
 
 _DEFAULT_OUT = Path("edited")
+_PATIENCE = 10.0
+"""Seconds for a page to end by itself."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,8 @@ def page_beside(options: PageOptions) -> Iterator[Beside]:
     finally:
         beside.is_closing = True
         process.terminate()
+        process.join(_PATIENCE)
+        process.kill()  # One that hangs, or was halted.
         process.join()
         teller.join()
 

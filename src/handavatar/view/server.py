@@ -34,7 +34,8 @@ from handavatar.view.turns import Turns
 
 MOST_WAITING = 64
 """Clients whose picture has not been begun; more are asked to try again."""
-_LOWEST_PRIORITY = 19
+_LOW_PRIORITY = 17
+"""Of pictures beside a training: where no core is idle they get a fiftieth of one (Linux)."""
 _LOOK_EVERY = 1.0
 """Seconds between two looks at a training."""
 _STOPPING = (signal.SIGINT, signal.SIGTERM)
@@ -97,20 +98,19 @@ class ViewServer:
         _end(*before)
 
     def _begin(self, shown: Studio | Watch) -> tuple[Turns, Films | None]:
+        if isinstance(shown, Watch):
+            turns = Turns({"fluid": _step_back, "field": _step_back}, MOST_WAITING)
+            self._http.answers = TrainingAnswers(shown, turns)
+            return turns, None
         # One core for what must be there at once: torch's threads are of no use to it, and it would
-        # wait for the field's pieces. Torch would give the other lane the number last set. Beside
-        # a training one is enough for all.
-        cores = self._cores if isinstance(shown, Studio) else 1
+        # wait for the field's pieces. Torch would give the other lane the number last set.
         turns = Turns(
             {
                 "fluid": lambda: torch.set_num_threads(1),
-                "field": lambda: torch.set_num_threads(cores),
+                "field": lambda: torch.set_num_threads(self._cores),
             },
             MOST_WAITING,
         )
-        if isinstance(shown, Watch):
-            self._http.answers = TrainingAnswers(shown, turns)
-            return turns, None
         films = Films(shown, turns)
         self._http.answers = AvatarAnswers(shown, turns, films, self.out)
         return turns, films
@@ -135,6 +135,12 @@ class ViewServer:
         self._http.server_close()
         self._http.hang_up()
         _end(self.turns, self.films)
+
+
+def _step_back() -> None:
+    """Leaves the cores to others, in a lane's thread: a priority is a thread's own on Linux."""
+    torch.set_num_threads(1)
+    os.nice(_LOW_PRIORITY)
 
 
 def _end(turns: Turns, films: Films | None) -> None:
@@ -211,8 +217,6 @@ def keep_serving(
 ) -> None:
     """Until it is stopped: looks on at a training, and goes over to the avatar when that is made.
 
-    Beside a training this process takes what time others leave; it stays so afterwards.
-
     Args:
         server: that answers.
         shown: by it now.
@@ -220,7 +224,6 @@ def keep_serving(
         is_stopped: asked ten times a second.
     """
     if isinstance(shown, Watch):
-        os.nice(_LOWEST_PRIORITY)
         looked, said = 0.0, ""
         while not is_stopped() and not shown.has_ended:
             time.sleep(0.1)

@@ -44,6 +44,19 @@ _MOST_LOG = 64 * 2**20
 
 
 @dataclass(frozen=True, eq=False)
+class Shown:
+    """A picture of an avatar in training.
+
+    Attributes:
+        pixels: of it.
+        label: the job and the step after which the avatar was so.
+    """
+
+    pixels: Pixels
+    label: str
+
+
+@dataclass(frozen=True, eq=False)
 class _Seen:
     """The avatar as the trainer last left it.
 
@@ -59,6 +72,12 @@ class _Seen:
     version: int
     poses: tuple[torch.Tensor, torch.Tensor] | None
 
+    @property
+    def label(self) -> str:
+        """When it was left, such as ``train 120``."""
+        live = self.avatar.info["live"]
+        return f"{live['job']} {live['step']}"
+
     @cached_property
     def baked(self) -> BakedAvatar:
         """For one thread."""
@@ -68,8 +87,8 @@ class _Seen:
 class Watch:
     """Looks on at a run; nothing that it does is waited for by the trainer.
 
-    :meth:`fluid` belongs to one thread, :meth:`refined` to another, :meth:`refresh` to a third;
-    all else may be called from any thread.
+    :meth:`fluid` belongs to one thread, :meth:`refined` to another; all else may be called from
+    any thread.
     """
 
     def __init__(self, folder: Path, settings: RenderSettings | None = None) -> None:
@@ -87,6 +106,7 @@ class Watch:
         self._seen: _Seen | None = None
         self._curves = _Curves(self._run.log)
         self._reading = threading.Lock()
+        self._taking = threading.Lock()
         self._frames: dict[int, Frame] = {}
         self._is_asked = False
         self._begin = time.time()
@@ -98,11 +118,10 @@ class Watch:
         return state is not None and state.phase == "finished" and self._run.avatar.is_file()
 
     def refresh(self) -> None:
-        """Looks how far the trainer is, and takes its newest avatar if a page has asked for any.
+        """Looks how far the trainer is, and tells it whether a page looks on.
 
         Raises:
             CaptureError: if the run's capture is no longer what it was.
-            CheckpointError: if the avatar cannot be read.
         """
         state = read_live(self._run)
         # What an earlier trainer has left is not news.
@@ -116,15 +135,13 @@ class Watch:
         if self._is_asked:
             self._is_asked = False
             look_on(self._run)
-            self._take_avatar()
 
     def about(self) -> dict[str, Any]:
         """How far it is, as JSON."""
         self._is_asked = True
-        state, seen, capture = self._state, self._seen, self._capture
+        state, capture = self._state, self._capture
         if state is None or capture is None:
             return {"phase": "waiting", "run": str(self._run.folder)}
-        live = seen.avatar.info["live"] if seen is not None else {}
         return {
             "phase": "training" if state.is_going_on else "stopped",
             "run": str(self._run.folder),
@@ -136,9 +153,8 @@ class Watch:
             "seconds_left": state.seconds_left,
             "figures": state.figures,
             "frames": len(self._numbers),
-            "avatar": None if seen is None else seen.version,
-            "avatar_job": live.get("job", ""),
-            "avatar_step": live.get("step", 0),
+            # As text: a page's numbers are not that long.
+            "avatar": str(version) if (version := self._version()) else None,
         }
 
     def curves(self) -> dict[str, Any]:
@@ -160,21 +176,24 @@ class Watch:
         pixels = np.asarray(picture)
         return np.ascontiguousarray(pixels[:, ::-1]) if self._side == "left" else pixels
 
-    def fluid(self, view: View) -> Pixels:
-        """The avatar in the frame's pose, from its posed mesh.
+    def fluid(self, view: View) -> Shown:
+        """The newest avatar in the frame's pose, from its posed mesh.
 
         Raises:
             SceneError: if there is no such frame, or no avatar yet.
+            CheckpointError: if the avatar cannot be read.
         """
         seen = self._newest()
         shot = self._shot(seen, view)
         if view.layer == "mesh":
-            return mesh_picture(posed_vertices(seen.twin, shot), seen.twin, shot, 1)
-        rendering = seen.baked.render(shot.pose, shot.camera, shot.edit)
-        return pass_pictures(rendering, self._side)[view.layer]
+            pixels = mesh_picture(posed_vertices(seen.twin, shot), seen.twin, shot, 1)
+        else:
+            rendering = seen.baked.render(shot.pose, shot.camera, shot.edit)
+            pixels = pass_pictures(rendering, self._side)[view.layer]
+        return Shown(pixels, seen.label)
 
-    def refined(self, view: View, stage: str, is_stale: Callable[[], bool]) -> Pixels:
-        """The same by the field.
+    def refined(self, view: View, stage: str, is_stale: Callable[[], bool]) -> Shown:
+        """The same by the field, of the avatar that the last fluid picture was of.
 
         Args:
             view: what is to be seen.
@@ -185,23 +204,37 @@ class Watch:
             Interrupted: as soon as it is stale.
             SceneError: if there is no such frame, or no avatar yet.
         """
-        seen = self._newest()
+        seen = self._seen or self._newest()
         is_full = stage == STAGES[-1]
         shot = self._shot(seen, view if is_full else replace(view, size=view.size // 2))
         if view.layer == "mesh":
-            return mesh_picture(posed_vertices(seen.avatar, shot), seen.avatar, shot, 2)
+            vertices = posed_vertices(seen.avatar, shot)
+            return Shown(mesh_picture(vertices, seen.avatar, shot, 2), seen.label)
         settings = self._settings if is_full else at_half(self._settings)
         rendering = rendered(seen.avatar, shot, settings, is_stale)
-        return pass_pictures(rendering, self._side)[view.layer]
+        return Shown(pass_pictures(rendering, self._side)[view.layer], seen.label)
 
     @property
     def _side(self) -> str:
         return "right" if self._capture is None else self._capture.side
 
+    def _version(self) -> int:
+        """Of the avatar's file; zero where there is none."""
+        try:
+            return live_avatar(self._run).stat().st_mtime_ns
+        except OSError:
+            return 0
+
     def _newest(self) -> _Seen:
-        if self._seen is None:
-            raise SceneError("there is no avatar to be seen yet: try again")
-        return self._seen
+        with self._taking:
+            before, version = self._seen, self._version()
+            if version and (before is None or before.version != version):
+                path = live_avatar(self._run)
+                avatar = HandAvatar.load(path) if before is None else before.avatar.reloaded(path)
+                self._seen = _Seen(avatar, copy.deepcopy(avatar), version, live_poses(avatar))
+            if self._seen is None:
+                raise SceneError("there is no avatar to be seen yet: try again")
+            return self._seen
 
     def _shot(self, seen: _Seen, view: View) -> Shot:
         frame = self._frame(view.frame)
@@ -223,18 +256,6 @@ class Watch:
                     self._frames.pop(next(iter(self._frames)))
                 self._frames[number] = capture.frame(self._numbers[number])
             return self._frames[number]
-
-    def _take_avatar(self) -> None:
-        try:
-            version = live_avatar(self._run).stat().st_mtime_ns
-        except OSError:
-            return
-        if self._seen is not None and self._seen.version == version:
-            return
-        path = live_avatar(self._run)
-        before = self._seen
-        avatar = HandAvatar.load(path) if before is None else before.avatar.reloaded(path)
-        self._seen = _Seen(avatar, copy.deepcopy(avatar), version, live_poses(avatar))
 
 
 class _Curves:

@@ -6,7 +6,7 @@ from handavatar.view.answers import client_in, order_in, waited
 from handavatar.view.connections import Answer, json_answer, page_file
 from handavatar.view.guard import Refused
 from handavatar.view.scene import fields, read_json, read_view, whole
-from handavatar.view.studio import STAGES, encoded
+from handavatar.view.studio import STAGES, Pixels, encoded
 from handavatar.view.training import Watch
 from handavatar.view.turns import Job, Turns
 
@@ -58,14 +58,21 @@ class TrainingAnswers:
         view = read_view(content.get("view", {}))
         stage = STAGES[whole(content.get("stage", 0), "stage", 0, len(STAGES) - 1)]
 
-        def work(job: Job) -> bytes:
+        def work(job: Job) -> Answer:
             if path == "/frame":
-                return encoded(self._watch.picture(view), "JPEG")
+                return _jpeg(self._watch.picture(view))
             if stage == STAGES[0]:
-                return encoded(self._watch.fluid(view), "JPEG")
-            return encoded(self._watch.refined(view, stage, job.is_stale), "JPEG")
+                shown = self._watch.fluid(view)
+            else:
+                shown = self._watch.refined(view, stage, job.is_stale)
+            return _jpeg(shown.pixels, ("Avatar", shown.label))
 
         lane = "fluid" if path == "/frame" or stage == STAGES[0] else "field"
         client = f"{path} {client_in(content)}"
         job = self._turns.submit(lane, client, order_in(content), work)
-        return Answer(waited(job, is_gone), "image/jpeg")
+        answer: Answer = waited(job, is_gone)
+        return answer
+
+
+def _jpeg(pixels: Pixels, *headers: tuple[str, str]) -> Answer:
+    return Answer(encoded(pixels, "JPEG"), "image/jpeg", headers)

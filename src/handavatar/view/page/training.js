@@ -7,6 +7,7 @@ const LAYERS = ["rgb", "albedo", "illumination", "normal", "mesh"];
 const STAGES = ["fluid", "half size", "full"];
 const STRIP = 24;       // thumbnails, evenly spread
 const TELL_EVERY = 1500;
+const PATIENCE = 8000;
 const DRAW_CURVES_EVERY = 3000;
 
 let about = null;
@@ -107,7 +108,7 @@ async function follow() {
       showProgress();
       if (about.phase !== "waiting") showFrames();
       // Colours are learned last; until then the shape is what there is to see.
-      if (about.avatar && !hasChosenLayer) setLayer(about.avatar_job === "train" ? "rgb" : "mesh");
+      if (about.avatar && !hasChosenLayer) setLayer(about.job === "train" ? "rgb" : "mesh");
       if (about.frames && (order === 0 || about.avatar !== before)) renewed();
       tell("");
     } catch (error) {
@@ -134,9 +135,10 @@ function setLayer(layer) {
   document.querySelector(`input[name=layer][value=${layer}]`).checked = true;
 }
 
-// A newer avatar: what is being made is finished first.
+// A newer avatar: what is being made is finished first, unless that takes long.
 function renewed() {
   order = Math.max(order, 1);
+  if (refining && refining.stage > 0 && performance.now() - refining.begun > PATIENCE) refining.abort();
   if (waiting) waiting();
 }
 
@@ -159,7 +161,6 @@ async function drawForever() {
     wish = order;
     const wanted = { ...view };
     const version = about.avatar;
-    const [job, step] = [about.avatar_job, about.avatar_step];
     refining = new AbortController();
     try {
       for (const canvas of [$("frame"), $("picture")]) if (canvas.width !== wanted.size) canvas.width = canvas.height = wanted.size;
@@ -172,9 +173,11 @@ async function drawForever() {
       for (let stage = 0; version !== null && stage <= Number($("detail").value); stage += 1) {
         if (wish !== order || (stage > 1 && version !== about.avatar)) break;
         const begin = performance.now();
-        if (!await draw($("picture"), await ask("picture", { client, order: wish, stage, view: wanted }, refining.signal))) break;
+        Object.assign(refining, { stage, begun: begin });
+        const answer = await ask("picture", { client, order: wish, stage, view: wanted }, refining.signal);
+        if (!await draw($("picture"), answer)) break;
         Object.assign($("picture").dataset, { stage, version, order: wish, frame: wanted.frame });
-        $("state").textContent = `the avatar at ${job} ${step}, ${STAGES[stage]} in ${((performance.now() - begin) / 1000).toFixed(1)} s`;
+        $("state").textContent = `the avatar at ${answer.headers.get("Avatar")}, ${STAGES[stage]} in ${((performance.now() - begin) / 1000).toFixed(1)} s`;
       }
       drawn = version;
     } catch (error) {
