@@ -109,7 +109,7 @@ def is_gone(process: int) -> bool:
 def test_losses_and_pictures_change_and_the_page_becomes_the_viewer(
     page: Any, tiny_capture: Path, tmp_path: Path
 ) -> None:
-    steps = ("--steps", "600")
+    steps = ("--steps", "400")
     alone = Training(tmp_path, tiny_capture, "alone", *steps)
     assert alone.process.wait(600) == 0, alone.err
     training = Training(tmp_path, tiny_capture, "seen", *steps, "--view", "--port", "0")
@@ -130,7 +130,7 @@ def test_losses_and_pictures_change_and_the_page_becomes_the_viewer(
         other.goto(training.address(page))
         other.select_option("#size", "512")
         other.select_option("#detail", "2")
-        other.wait_for_selector("#picture[data-stage='0']")
+        other.wait_for_function("() => picture.width == 512")
         other.close()
 
         page.click("#frames canvas[data-frame='2']")
