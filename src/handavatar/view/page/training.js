@@ -56,7 +56,9 @@ function showProgress() {
   const figures = Object.entries(about.figures).map(([name, value]) => `${name} ${value}`);
   const where = about.job ? `${about.job}: step ${about.step} of ${about.total}` : "training begins";
   const parts = about.phase === "stopped" ? [where, "training has stopped; the same command with --resume auto continues it"]
-    : about.job ? [where, speed, duration(about.seconds_left), ...figures] : [where];
+    : !about.job ? [where]
+      : about.step >= about.total ? [`${about.job}: done; what comes next is being prepared`]
+        : [where, speed, duration(about.seconds_left), ...figures];
   $("job").textContent = parts.join("   ");
   $("job").dataset.phase = about.phase;
   $("job").dataset.job = about.job;
