@@ -89,6 +89,8 @@ function showFrames() {
 }
 
 async function drawTiles() {
+  // The avatar first: where cores are busy every picture waits for its turn.
+  for (let waited = 0; waited < 20 && !$("picture").dataset.version; waited += 1) await sleep(500);
   let number = 0;
   for (const tile of $("frames").children) {
     number += 1;
