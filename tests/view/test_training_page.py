@@ -90,7 +90,7 @@ def browser() -> Iterator[Any]:
 def page(browser: Any) -> Iterator[Any]:
     context = browser.new_context(viewport={"width": 1200, "height": 800})
     made = context.new_page()
-    made.set_default_timeout(180_000)
+    made.set_default_timeout(400_000)
     made.strays = []
     made.on("pageerror", lambda error: made.strays.append(str(error)))
     yield made
@@ -109,9 +109,9 @@ def is_gone(process: int) -> bool:
 def test_losses_and_pictures_change_and_the_page_becomes_the_viewer(
     page: Any, tiny_capture: Path, tmp_path: Path
 ) -> None:
-    steps = ("--steps", "400")
+    steps = ("--steps", "200")
     alone = Training(tmp_path, tiny_capture, "alone", *steps)
-    assert alone.process.wait(600) == 0, alone.err
+    assert alone.process.wait(1800) == 0, alone.err
     training = Training(tmp_path, tiny_capture, "seen", *steps, "--view", "--port", "0")
     try:
         page.goto(training.address(page))
@@ -217,7 +217,7 @@ def test_a_killed_trainer_takes_its_page_along_and_view_looks_on_at_another(
         )
         assert watching.stdout is not None
         other = page.context.new_page()
-        other.set_default_timeout(180_000)
+        other.set_default_timeout(400_000)
         other.goto(watching.stdout.readline().split()[1])
         other.wait_for_selector("#picture[data-version]")
         training.process.kill()
