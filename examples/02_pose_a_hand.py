@@ -13,11 +13,10 @@ import torch
 import tyro
 from PIL import Image
 
-from handavatar.animate import camera_on, orbited, pass_pictures
+from handavatar.animate import camera_on, orbited, pass_pictures, posed_as_seen
 from handavatar.avatar import HandAvatar
-from handavatar.capture.motion import Motion, gesture, middle_of_hand, write_motion
-from handavatar.capture.view import start_of
-from handavatar.hand.pose import BONE_NAMES, FINGER_BONES, NUM_BONES, HandPose
+from handavatar.capture.motion import Motion, middle_of_hand, write_motion
+from handavatar.hand.pose import BONE_NAMES, FINGER_BONES, NUM_BONES
 from handavatar.hand.pose_sampling import clamped_angles, rotations_from_angles
 
 
@@ -54,24 +53,17 @@ degrees[list(FINGER_BONES["ring"]), 0] = 70.0
 degrees[list(FINGER_BONES["little"]), 0] = 70.0
 degrees[BONE_NAMES.index("index1"), 1] = 200.0  # An index finger spreads by 16 degrees at most.
 own = rotations_from_angles(rig, clamped_angles(degrees.deg2rad()))
-fingers = {name: gesture(rig, name) for name in ("spread", "relaxed", "victory")} | {"own": own}
 
 # An avatar has learned its light as well. It looks right where its capture has seen the hand, so
-# take the wrist from there.
-start = start_of(avatar.info.get("view"))
-poses = []
-for rotations in fingers.values():
-    rotations[0] = start.rotations[0]
-    poses.append(HandPose(rotations, start.translation))
+# take the wrist from there. Gestures have names.
+gestures = ("spread", "relaxed", "victory")
+poses = [posed_as_seen(avatar, name) for name in gestures] + [posed_as_seen(avatar, own)]
 
 # %% Cameras
 # One that holds the hand in all the poses, and the same one carried around the hand. From the side
 # a hand may reach farther than from the front: the view leaves room all around.
-room = options.size / 8
-front = camera_on(avatar, poses, options.size)
-front = front.cropped(-room, -room, options.size + 2 * room, options.size + 2 * room)
-front = front.resized(options.size, options.size)
-middle = middle_of_hand(rig, start)
+front = camera_on(avatar, poses, options.size, room=0.44)
+middle = middle_of_hand(rig, poses[0])
 cameras = [orbited(front, middle, math.radians(turn)) for turn in (-50, 0, 50)]
 
 rows = []
@@ -81,7 +73,7 @@ for pose in poses:
     rows.append(np.concatenate([pass_pictures(view, side)["rgb"] for view in views], axis=1))
 sheet = np.concatenate(rows, axis=0)
 Image.fromarray(sheet).save(options.out / "poses.png")
-print(f"{options.out / 'poses.png'}: {', '.join(fingers)}, each from three sides")
+print(f"{options.out / 'poses.png'}: {', '.join(gestures)} and our own, each from three sides")
 
 # %% A motion
 # Poses in a row are a motion; the command line renders it to a video:

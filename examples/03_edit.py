@@ -12,12 +12,10 @@ import torch
 import tyro
 from PIL import Image
 
-from handavatar.animate import camera_on, pass_pictures
+from handavatar.animate import camera_on, pass_pictures, posed_as_seen
 from handavatar.avatar import HandAvatar
-from handavatar.capture.motion import gesture
-from handavatar.capture.view import start_of
 from handavatar.edit import Edit, Paint, bones_named
-from handavatar.hand.pose import FINGER_BONES, HandPose
+from handavatar.hand.pose import FINGER_BONES
 
 
 # %% Options
@@ -63,10 +61,7 @@ edits = {
 # A thumb before the palm, so that there is a shadow to lift. An avatar of method "quick" guesses
 # its shadows from what the view ray passes: what is left without them may even be darker. "best"
 # traces light to the hand instead.
-start = start_of(avatar.info.get("view"))
-rotations = gesture(avatar.base_rig, "four")
-rotations[0] = start.rotations[0]
-pose = HandPose(rotations, start.translation)
+pose = posed_as_seen(avatar, "four")
 camera = camera_on(avatar, [pose], options.size)
 
 side = avatar.info.get("side", "right")

@@ -1,5 +1,6 @@
 """Motions to pictures and videos: what is written, and what is refused."""
 
+import copy
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -19,11 +20,13 @@ from handavatar.animate import (
     camera_on,
     orbited,
     pass_pictures,
+    posed_as_seen,
     render_motion,
     rendering_error,
 )
 from handavatar.avatar import CheckpointError, HandAvatar, Rendering, RenderSettings
 from handavatar.capture.frames import CaptureError
+from handavatar.capture.motion import gesture
 from handavatar.geometry.cameras import project
 from handavatar.hand.pose import HandPose
 
@@ -285,6 +288,31 @@ def test_the_camera_holds_the_hand_in_every_pose(small_avatar: HandAvatar) -> No
         vertices = small_avatar.rig.shaped(small_avatar.coefficients).posed(pose).vertices
         pixels, depths = project(camera, vertices)
         assert float(pixels.min()) > 0 and float(pixels.max()) < 100 and float(depths.min()) > 0
+
+
+def test_a_camera_leaves_the_room_it_is_asked_for(small_avatar: HandAvatar) -> None:
+    vertices = small_avatar.rig.shaped(small_avatar.coefficients).posed(bent_pose(3)).vertices
+    for room in (0.0, 0.15, 1.0):
+        pixels, _ = project(camera_on(small_avatar, [bent_pose(3)], 100, room), vertices)
+        lower, upper = pixels.amin(0), pixels.amax(0)
+        assert float((upper - lower).max()) == pytest.approx(100 / (1 + room), abs=1e-3)
+        torch.testing.assert_close((lower + upper) / 2, torch.tensor([50.0, 50.0]))
+
+
+def test_a_gesture_stands_where_the_capture_saw_the_hand(small_avatar: HandAvatar) -> None:
+    avatar = copy.copy(small_avatar)
+    avatar.info = {"view": {"rotations": [[0.1, 0.2, 0.3]] * 16, "translation": [1.0, 2.0, 3.0]}}
+    pose = posed_as_seen(avatar, "victory")
+    assert pose.translation.tolist() == [1.0, 2.0, 3.0]
+    torch.testing.assert_close(pose.rotations[0], torch.tensor([0.1, 0.2, 0.3]))
+    fingers = gesture(avatar.base_rig, "victory")
+    assert torch.equal(pose.rotations[1:], fingers[1:])
+    own = posed_as_seen(avatar, fingers)
+    assert torch.equal(own.rotations, pose.rotations)
+    assert not fingers[0].any()  # What was given stays as it was.
+    assert torch.equal(posed_as_seen(small_avatar, fingers).rotations, fingers)
+    with pytest.raises(CaptureError, match="no gesture"):
+        posed_as_seen(avatar, "none")
 
 
 def test_orbiting_keeps_the_centre_in_place_and_comes_round() -> None:

@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -16,6 +17,7 @@ from handavatar.avatar import (
     SCHEMA,
     CheckpointError,
     HandAvatar,
+    HandState,
     Rendering,
     RenderSettings,
 )
@@ -25,6 +27,7 @@ from handavatar.field.shading import CueSet, OrientedCues, TracedCues
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.detail import subdivided
+from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import POINT_ROUNDS, divide_into_parts
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
@@ -97,6 +100,51 @@ def test_a_batch_is_rendered_as_its_hands_are_one_by_one(small_avatar: HandAvata
         assert torch.equal(picture.color, small_avatar.render(pose, camera).color)
     with pytest.raises(ValueError, match="3 poses and 2 cameras"):
         small_avatar.render_batch(poses, cameras[:2])
+
+
+def test_a_later_state_is_read_as_a_file_is(small_avatar: HandAvatar, tmp_path: Path) -> None:
+    small_avatar.save(tmp_path / "one.safetensors")
+    later = HandAvatar.load(tmp_path / "one.safetensors")
+    with torch.no_grad():
+        later.albedo.codes.add_(0.1)
+    later.info, later.edit, later.occupancy.sharpness = {"step": 3}, Edit(light_gain=1.5), 2.0
+    later.save(tmp_path / "two.safetensors")
+    before = {name: value.clone() for name, value in small_avatar.state_dict().items()}
+    found = small_avatar.reloaded(tmp_path / "two.safetensors")
+    for name, value in later.state_dict().items():
+        assert torch.equal(found.state_dict()[name], value), name
+        assert torch.equal(small_avatar.state_dict()[name], before[name]), name
+    assert found.info == {"step": 3} and found.edit == later.edit
+    assert found.occupancy.sharpness == 2.0 and small_avatar.occupancy.sharpness == 1.0
+    other = HandAvatar(load_open_hand("778"), torch.zeros(10), rounds=1, num_anchors=256)
+    other.save(tmp_path / "other.safetensors")
+    with pytest.raises(CheckpointError, match="of another rig"):
+        small_avatar.reloaded(tmp_path / "other.safetensors")
+    (tmp_path / "two.safetensors").write_bytes(b"x")
+    with pytest.raises(CheckpointError, match="damaged"):
+        small_avatar.reloaded(tmp_path / "two.safetensors")
+
+
+def test_in_a_batch_a_pose_is_prepared_once(
+    small_avatar: HandAvatar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared: list[HandPose] = []
+    prepare = HandAvatar.prepare
+
+    def counted(self: HandAvatar, pose: HandPose, *rest: Any) -> HandState:
+        prepared.append(pose)
+        return prepare(self, pose, *rest)
+
+    poses = [bent_pose(1), bent_pose(2)]
+    cameras = [camera_above(12), camera_above(16)]
+    edit = Edit(light_gain=1.2, lifted_bones=(13, 14, 15))
+    alone = [small_avatar.render(pose, camera, edit) for camera in cameras for pose in poses]
+    monkeypatch.setattr(HandAvatar, "prepare", counted)
+    found = small_avatar.render_batch(2 * poses, [cameras[n // 2] for n in range(4)], edit)
+    assert len(prepared) == 2
+    for picture, expected in zip(found, alone, strict=True):
+        assert torch.equal(picture.color, expected.color)
+    assert small_avatar.render_batch([], []) == []
 
 
 def test_at_the_outline_a_pixel_is_the_mean_of_four_rays(

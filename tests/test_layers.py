@@ -30,8 +30,9 @@ MAY_IMPORT = {
         "peers": "geometry hand capture field render avatar evaluate train",
         # A texture's chart is rasterised; words of an edit mean what they mean elsewhere.
         "export": "geometry hand capture field render edit avatar retouch unfinished",
-        # Its fluid pictures bake the fields on the mesh; its others are what `animate` makes.
-        "view": "geometry hand capture field render edit avatar animate",
+        # Its fluid pictures bake the fields on the mesh; its others are what `animate` makes. What
+        # a trainer leaves for others to see is read where it is written.
+        "view": "geometry hand capture field render edit avatar retouch animate train",
         # What words and pictures mean to an avatar.
         "retouch": "hand capture edit avatar",
         "processes": "",

@@ -38,7 +38,7 @@ EXACTLY = {
     "capture.default": "default_capture",
 }
 AT_LEAST = {
-    "animate": "RenderOptions render_motion camera_on orbited pass_pictures",
+    "animate": "RenderOptions render_motion camera_on orbited pass_pictures posed_as_seen",
     "avatar": "HandAvatar.load HandAvatar.render HandAvatar.save",
     "hand.pose": "HandPose.flat",
     "hand.rig": "Rig.shaped ShapedHand.posed",

@@ -17,11 +17,12 @@ from typing import Any, Literal
 import av
 import numpy as np
 import torch
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
 from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chosen_device
-from handavatar.capture.motion import open_motion
+from handavatar.capture.motion import gesture, open_motion
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
 from handavatar.field.kernels import Kernel, chosen_kernel
@@ -248,13 +249,33 @@ def _png(pixels: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def camera_on(avatar: HandAvatar, poses: list[HandPose], size: int) -> Camera:
+def posed_as_seen(avatar: HandAvatar, fingers: str | Float[Tensor, "bones 3"]) -> HandPose:
+    """A pose of the fingers, with the wrist as the avatar's capture has typically seen it.
+
+    An avatar has learned its light as well: it looks right where its capture has seen the hand.
+
+    Args:
+        avatar: knows the view of its capture; the wrist is at the origin if it does not.
+        fingers: name of a gesture, or rotations whose wrist plays no part.
+
+    Raises:
+        CaptureError: for a name that no gesture has.
+    """
+    start = start_of(avatar.info.get("view"))
+    if isinstance(fingers, str):
+        fingers = gesture(avatar.base_rig.to("cpu"), fingers)
+    return replace(start, rotations=torch.cat([start.rotations[:1], fingers[1:].cpu()]))
+
+
+def camera_on(avatar: HandAvatar, poses: list[HandPose], size: int, room: float = 0.15) -> Camera:
     """A square camera where the capture's was, that holds the hand in all the poses.
 
     Args:
         avatar: knows the view of its capture.
         poses: to be held.
         size: pixels along a side.
+        room: around the hand, as a share of its longer side, half of it on either side. A camera
+            that is to be carried around the hand needs more, for from there it may reach farther.
     """
     view = avatar.info.get("view")
     if view is None:
@@ -269,7 +290,7 @@ def camera_on(avatar: HandAvatar, poses: list[HandPose], size: int) -> Camera:
         rest = avatar.rig.to("cpu").shaped(avatar.coefficients.cpu())
         seen = torch.cat([project(wide, rest.posed(pose).vertices)[0] for pose in poses])
     lower, upper = seen.amin(0), seen.amax(0)
-    side = float((upper - lower).max()) * 1.15
+    side = float((upper - lower).max()) * (1 + room)
     left, top = ((lower + upper) / 2 - side / 2).tolist()
     focal = size / side
     return Camera((focal, focal), (-left * focal, -top * focal), size, size, placed)

@@ -5,6 +5,7 @@ illumination. ``prepare`` does what is needed once per pose, ``render_rays`` wha
 ray; training and rendering go through the same two calls.
 """
 
+import copy
 import json
 import math
 from collections.abc import Sequence
@@ -528,8 +529,12 @@ class HandAvatar(nn.Module):
 
         Departs: the authors send one ray through every pixel, and the outline is jagged.
         """
-        settings = settings or RenderSettings()
         state = self.prepare(pose.to(self.device), edit.lifted_bones if edit else ())
+        return self._picture(state, camera, edit, settings or RenderSettings())
+
+    def _picture(
+        self, state: HandState, camera: Camera, edit: Edit | None, settings: RenderSettings
+    ) -> Rendering:
         camera = camera.to(self.device)
         near = self.near_mesh(state, camera, settings.mask_margin).flatten().nonzero()[:, 0]
         centers = pixel_centers(camera).flatten(0, 1)
@@ -561,6 +566,8 @@ class HandAvatar(nn.Module):
     ) -> list[Rendering]:
         """The pictures that :meth:`render` makes one by one; on a CPU side by side, a thread each.
 
+        What the pictures of a pose share is done once, if it is the same object every time.
+
         Raises:
             ValueError: if there are not as many cameras as poses.
         """
@@ -569,8 +576,15 @@ class HandAvatar(nn.Module):
                 f"render_batch: found {len(poses)} poses and {len(cameras)} cameras, expected as "
                 "many of both"
             )
-        views = zip(poses, cameras, strict=True)
-        return mapped(lambda view: self.render(*view, edit, settings), views)
+        lifted_bones = edit.lifted_bones if edit else ()
+        settings = settings or RenderSettings()
+        states = mapped(
+            lambda pose: self.prepare(pose.to(self.device), lifted_bones),
+            {id(pose): pose for pose in poses}.values(),
+        )
+        state_of = dict(zip(dict.fromkeys(map(id, poses)), states, strict=True))
+        views = [(state_of[id(pose)], camera) for pose, camera in zip(poses, cameras, strict=True)]
+        return mapped(lambda view: self._picture(*view, edit, settings), views)
 
     def at_pixels(
         self,
@@ -682,29 +696,7 @@ class HandAvatar(nn.Module):
             CheckpointError: if the file is missing, damaged, or not an avatar of this schema.
             RigError: if it was made with a licensed rig that is not imported here.
         """
-        path = Path(path)
-        if path.is_dir():
-            if not (path / "avatar.safetensors").is_file():
-                raise CheckpointError(
-                    f"{path}: holds no avatar.safetensors; finish its training with "
-                    "`handavatar train ... --resume auto`"
-                )
-            path = path / "avatar.safetensors"
-        if not path.is_file():
-            raise CheckpointError(f"{path}: no such file; train an avatar or name an existing one")
-        try:
-            with safe_open(path, framework="pt") as file:
-                about = json.loads((file.metadata() or {}).get("handavatar", "null"))
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        except Exception as error:
-            raise CheckpointError(
-                f"{path}: cannot be read as safetensors ({error}); the file is damaged or not "
-                "complete: copy it again or take it from the run's last checkpoint"
-            ) from error
-        if not isinstance(about, dict) or about.get("schema") != SCHEMA:
-            raise CheckpointError(
-                f"{path}: not an avatar of schema {SCHEMA}; train it again with this version"
-            )
+        about, tensors = _stored(Path(path))
         licensed_rig: Rig | None = None
         if about.get("rig_is_licensed"):
             licensed_rig = find_rig(str(about.get("rig_sha256")), str(about.get("rig")))
@@ -718,18 +710,68 @@ class HandAvatar(nn.Module):
                 rounds=about["rounds"],
                 anchors=anchors,
                 cues=cue_set(about["cues"], len(state["illumination.directions"])),
-                info=about["info"],
             )
-            avatar.occupancy.margin = about["margin"]
-            avatar.occupancy.softness = about["softness"]
-            avatar.occupancy.sharpness = about["sharpness"]
-            if rig.is_licensed:
-                state |= {name: avatar.state_dict()[name] for name in _OF_LICENSED_RIG}
-            avatar.load_state_dict(state)
-            avatar.edit = _stored_edit(about["edit"], tensors)
+            avatar._restore(about, tensors)
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
             raise CheckpointError(f"{path}: not a complete avatar ({error})") from error
         return avatar
+
+    def reloaded(self, path: Path) -> "HandAvatar":
+        """As :meth:`load`, of another state of this very avatar: the rig is not made finer anew.
+
+        Args:
+            path: an avatar file; this avatar stays as it is.
+
+        Raises:
+            CheckpointError: as :meth:`load`; or if the file is of another rig.
+        """
+        about, tensors = _stored(path)
+        avatar = copy.deepcopy(self)
+        try:
+            if (about["rig_sha256"], about["rounds"]) != (self.base_rig.sha256, self.rounds):
+                raise ValueError("it is of another rig")
+            avatar._restore(about, tensors)
+        except (KeyError, RuntimeError, TypeError, ValueError) as error:
+            raise CheckpointError(f"{path}: not a state of this avatar ({error})") from error
+        return avatar
+
+    def _restore(self, about: dict[str, Any], tensors: dict[str, Tensor]) -> None:
+        state = {name[7:]: v for name, v in tensors.items() if name.startswith("avatar.")}
+        if self.base_rig.is_licensed:
+            state |= {name: self.state_dict()[name] for name in _OF_LICENSED_RIG}
+        self.info = about["info"]
+        self.occupancy.margin = about["margin"]
+        self.occupancy.softness = about["softness"]
+        self.occupancy.sharpness = about["sharpness"]
+        self.load_state_dict(state)
+        self.edit = _stored_edit(about["edit"], tensors)
+
+
+def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """What an avatar file holds, or the folder of a finished run."""
+    if path.is_dir():
+        if not (path / "avatar.safetensors").is_file():
+            raise CheckpointError(
+                f"{path}: holds no avatar.safetensors; finish its training with "
+                "`handavatar train ... --resume auto`"
+            )
+        path = path / "avatar.safetensors"
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such file; train an avatar or name an existing one")
+    try:
+        with safe_open(path, framework="pt") as file:
+            about = json.loads((file.metadata() or {}).get("handavatar", "null"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except Exception as error:
+        raise CheckpointError(
+            f"{path}: cannot be read as safetensors ({error}); the file is damaged or not "
+            "complete: copy it again or take it from the run's last checkpoint"
+        ) from error
+    if not isinstance(about, dict) or about.get("schema") != SCHEMA:
+        raise CheckpointError(
+            f"{path}: not an avatar of schema {SCHEMA}; train it again with this version"
+        )
+    return about, tensors
 
 
 def _sampled(

@@ -4,9 +4,9 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
+from PIL import Image
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar
@@ -111,17 +111,25 @@ def paint_from(path: Path, avatar: HandAvatar) -> Paint:
     Raises:
         CaptureError: if the file is no picture, or covers everything or nothing.
     """
-    picture = open_picture(path)
-    if picture.mode not in ("RGBA", "LA", "PA") and "transparency" not in picture.info:
-        picture.close()
-        raise CaptureError(
-            f"{path.name} has no transparency", "save a PNG that is transparent where skin stays"
-        )
-    pixels = torch.from_numpy(decoded(picture.convert("RGBA"), path.name).astype(np.float32) / 255)
+    return paint_of(open_picture(path), path.name, avatar)
+
+
+def paint_of(picture: Image.Image, name: str, avatar: HandAvatar) -> Paint:
+    """As :func:`paint_from`, of a picture that was opened; closes it.
+
+    Raises:
+        CaptureError: if it is damaged, or has no transparency.
+    """
+    with picture:
+        if picture.mode not in ("RGBA", "LA", "PA") and "transparency" not in picture.info:
+            raise CaptureError(
+                f"{name} has no transparency", "save a PNG that is transparent where skin stays"
+            )
+        pixels = torch.from_numpy(decoded(picture, name, "RGBA"))
     places = anchor_places(avatar.rig, avatar.anchor_corners, avatar.anchor_barycentric)
     size = places.new_tensor([pixels.shape[1], pixels.shape[0]])
     column, row = (places * size).long().clamp_min(0).minimum(size.long() - 1).unbind(-1)
-    chosen = pixels.to(places.device)[row, column]
+    chosen = pixels[row.cpu(), column.cpu()].to(places) / 255
     return Paint(chosen[:, :3], chosen[:, 3])
 
 

@@ -90,7 +90,12 @@ def test_what_another_site_makes_the_browser_ask_is_refused() -> None:
     # A form of another site can send these kinds without asking first.
     for kind in ("text/plain", "application/x-www-form-urlencoded", "multipart/form-data", ""):
         assert status(LOCAL, "POST", "/avatar", Content_Type=kind) == 415
+        assert status(LOCAL, "POST", "/paint", Content_Type=kind) == 415
     assert status(LOCAL, "POST", "/avatar", Content_Type="application/json; charset=utf-8") == 200
+    # A picture goes to its own address, and nothing else does.
+    assert status(LOCAL, "POST", "/paint", Content_Type="image/png") == 200
+    assert status(LOCAL, "POST", "/paint", Content_Type="application/json") == 415
+    assert status(LOCAL, "POST", "/avatar", Content_Type="image/png") == 415
 
 
 def test_beyond_loopback_a_token_is_made_and_asked_for() -> None:

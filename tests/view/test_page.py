@@ -188,6 +188,44 @@ def test_paint_stays_where_it_is_put(page: Any) -> None:
     assert (settled(page) == before).all()
 
 
+def test_a_picture_is_painted_and_taken_back(page: Any, server: ViewServer, tmp_path: Path) -> None:
+    page.check("input[name=layer][value=albedo]")
+    before = settled(page)
+    pixels = np.zeros((32, 32, 4), dtype=np.uint8)
+    pixels[...] = (0, 90, 255, 255)
+    Image.fromarray(pixels).save(tmp_path / "blue.png")
+    page.set_input_files("#paint-picture", tmp_path / "blue.png")
+    page.wait_for_function("() => scene.touches.strokes.length == 1")
+    painted = settled(page)
+    inside = before.min(-1) > 40
+    assert np.abs(painted[inside].mean(0) - (0, 90, 255)).max() < 25
+    assert "blue.png" in page.inner_text("#saved")
+    with page.expect_response("**/avatar") as answer:
+        page.click("#save-avatar")
+    paint = HandAvatar.load(Path(json.loads(answer.value.body())["path"])).edit.paint
+    assert paint is not None and float(paint.opacity.min()) == 1
+    page.click("#undo")
+    assert (settled(page) == before).all()
+
+
+def test_what_is_no_picture_is_said_on_the_page(
+    browser: Any, server: ViewServer, tmp_path: Path
+) -> None:
+    context = browser.new_context()
+    page = context.new_page()
+    page.goto(server.address)
+    page.wait_for_selector("canvas[data-stage]")
+    (tmp_path / "text.png").write_text("no picture")
+    page.set_input_files("#paint-picture", tmp_path / "text.png")
+    page.wait_for_selector("#problem:not([hidden])")
+    assert "not a PNG" in page.inner_text("#problem")
+    (tmp_path / "large.png").write_bytes(bytes(4 * 2**20 + 1))
+    page.set_input_files("#paint-picture", tmp_path / "large.png")
+    page.wait_for_function("() => problem.textContent.includes('at most 4194304')")
+    assert page.evaluate("scene.touches.strokes.length") == 0
+    context.close()
+
+
 def test_a_motion_plays_and_stands_where_it_is_put(page: Any) -> None:
     settled(page)
     page.select_option("#motion", "wave")

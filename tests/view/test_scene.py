@@ -8,14 +8,17 @@ import pytest
 
 from handavatar.view.scene import (
     MOST_STROKES,
+    Coat,
     Moment,
     Orbit,
     Scene,
     SceneError,
     Stroke,
     Touches,
+    View,
     read_json,
     read_scene,
+    read_view,
 )
 
 WHOLE = {
@@ -45,6 +48,20 @@ def test_everything_that_a_page_says_is_in_the_scene() -> None:
         384,
         Touches(1.5, (0.1, 0.0, -0.1), (13, 14, 15, 10), (Stroke(7, 0.005, (1.0, 0.0, 0.5)),)),
     )
+
+
+def test_a_picture_is_a_stroke_among_others() -> None:
+    strokes = [{"picture": "abc"}, {"anchor": 1, "radius": 2, "color": [0, 0, 0]}]
+    read = read_scene({"touches": {"strokes": strokes}}).touches.strokes
+    assert read == (Coat("abc"), Stroke(1, 0.002, (0.0, 0.0, 0.0)))
+
+
+def test_a_view_of_a_training_is_read_or_refused() -> None:
+    assert read_view({}) == View(0, "rgb", 256)
+    assert read_view({"frame": 7, "layer": "mesh", "size": 64}) == View(7, "mesh", 64)
+    for wrong in ({"frame": -1}, {"frame": 1.5}, {"layer": "x"}, {"size": 63}, {"x": 1}, [], None):
+        with pytest.raises(SceneError):
+            read_view(wrong)
 
 
 def test_what_is_left_out_is_as_by_default() -> None:
@@ -81,6 +98,9 @@ def test_what_is_left_out_is_as_by_default() -> None:
         ({"touches": {"lift_shadow": ["thumb"] * 17}}, "at most 16"),
         ({"touches": {"strokes": [{"anchor": 1}]}}, "radius"),
         ({"touches": {"strokes": [None]}}, "stroke"),
+        ({"touches": {"strokes": [{"picture": 7}]}}, "picture: expected a name"),
+        ({"touches": {"strokes": [{"picture": "x" * 41}]}}, "picture: expected a name"),
+        ({"touches": {"strokes": [{"picture": "x", "anchor": 1}]}}, "there is no 'anchor'"),
         (
             {"touches": {"strokes": WHOLE["touches"]["strokes"] * (MOST_STROKES + 1)}},  # type: ignore[index]
             "strokes",

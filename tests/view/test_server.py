@@ -24,8 +24,9 @@ from PIL import Image
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.motion import write_motion
+from handavatar.view.connections import MOST_BYTES, MOST_CONNECTIONS
 from handavatar.view.guard import guard_of
-from handavatar.view.server import MOST_BYTES, MOST_CONNECTIONS, ViewServer, serving
+from handavatar.view.server import ViewServer, serving
 from handavatar.view.studio import Studio
 
 SCENE = {"size": 64}

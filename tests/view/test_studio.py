@@ -23,7 +23,7 @@ from handavatar.hand.pose_sampling import angles_from_rotations
 from handavatar.train.prior import load_prior
 from handavatar.view.baked import BakedAvatar, dabbed
 from handavatar.view.scene import LAYERS, Moment, Orbit, Scene, SceneError, Stroke, Touches
-from handavatar.view.studio import Interrupted, Studio, orbiting
+from handavatar.view.studio import Interrupted, Studio, orbiting, rendered
 
 SIZE = 64
 FEW = RenderSettings(num_samples=16)
@@ -110,7 +110,7 @@ def test_the_avatars_own_edit_is_where_pages_begin_and_can_be_taken_back(
     assert studio.edit(Touches()).light_gain == 1.0
     start = Touches(1.5, (0.1, 0.0, 0.0), (13, 14, 15, 1))
     shot = studio.shot(Scene(size=SIZE, touches=start))
-    found = studio.rendering(shot, FEW, never)
+    found = rendered(studio._avatar, shot, FEW, never)
     wanted = edited.render(shot.pose, shot.camera, None, FEW)
     assert torch.equal(found.color, wanted.color)
 

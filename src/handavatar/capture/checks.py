@@ -6,7 +6,7 @@ Every check raises :class:`CaptureError` with what was found and what to do; cal
 import json
 import math
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from PIL import Image
@@ -146,35 +146,58 @@ def open_picture(path: Path) -> Image.Image:
     Raises:
         CaptureError: if it is another kind of file or has more than 64 megapixels.
     """
+    return picture_in(path, path.name, ("PNG", "JPEG"), MAX_PIXELS)
+
+
+def picture_in(
+    source: Path | IO[bytes], name: str, formats: tuple[str, ...], most_pixels: int
+) -> Image.Image:
+    """A picture whose header is sound; no pixel is decoded yet.
+
+    Args:
+        source: file, or its bytes.
+        name: of the picture, for messages.
+        formats: kinds of file, as Pillow names them.
+        most_pixels: width times height, at most.
+
+    Raises:
+        CaptureError: if it is another kind of file, or larger.
+    """
+    megapixels = most_pixels // 10**6
     try:
-        picture = Image.open(path, formats=("PNG", "JPEG"))
+        picture = Image.open(source, formats=formats)
     except Image.DecompressionBombError as error:
         raise CaptureError(
-            f"{path.name} claims more than {MAX_PIXELS // 10**6} megapixels", "make it smaller"
+            f"{name} claims more than {megapixels} megapixels", "make it smaller"
         ) from error
     except (OSError, ValueError, SyntaxError) as error:
+        kinds = " or ".join(formats)
         raise CaptureError(
-            f"{path.name} is not a PNG or JPEG that can be read", "save it again as PNG"
+            f"{name} is not a {kinds} that can be read", f"save it again as {formats[0]}"
         ) from error
     width, height = picture.size
-    if width * height > MAX_PIXELS:
+    if width * height > most_pixels:
         picture.close()
         raise CaptureError(
-            f"{path.name} is {width} x {height}, more than {MAX_PIXELS // 10**6} megapixels",
-            "make it smaller",
+            f"{name} is {width} x {height}, more than {megapixels} megapixels", "make it smaller"
         )
     return picture
 
 
-def decoded(picture: Image.Image, name: str) -> np.ndarray:
+def decoded(picture: Image.Image, name: str, mode: str = "") -> np.ndarray:
     """All pixels of an opened picture; closes it.
+
+    Args:
+        picture: as :func:`open_picture` gives it.
+        name: for the message.
+        mode: to convert it to, as Pillow names it; by default as it is stored.
 
     Raises:
         CaptureError: if the file ends early or is damaged.
     """
     try:
         with picture:
-            return np.array(picture)
+            return np.array(picture.convert(mode) if mode else picture)
     except (OSError, ValueError, SyntaxError) as error:
         raise CaptureError(
             f"{name} is damaged: {str(error)[:120]}", "restore the file, or drop the frame"

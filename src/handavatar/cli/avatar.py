@@ -1,15 +1,48 @@
 """From a capture to an avatar, and all that is done with one: train, evaluate, render, ..."""
 
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from handavatar.train.loop import TrainOptions
+
 
 def train(words: list[str]) -> int:
-    """Capture -> avatar."""
-    from handavatar.cli.arguments import parse
-    from handavatar.train.loop import TrainOptions
+    """Capture -> avatar; with --view, live in the browser."""
+    from handavatar.cli.arguments import Extra, parse_with
+    from handavatar.train.loop import TrainOptions, run_folder
     from handavatar.train.loop import train as train_avatar
 
-    run = train_avatar(parse(TrainOptions, words, "train", positional=("capture",)))
-    print(f"run: {run}\nnext: handavatar evaluate {run}")
+    page = (
+        Extra("view", bool, "a page shows the training, and afterwards the avatar", False),
+        Extra("port", int, "of the page; if it is taken, the next free one", 7007),
+        Extra("host", str, "where the page listens, as for view", "127.0.0.1"),
+        Extra("token", str, "who does not know it does not see the page, as for view", ""),
+    )
+    options, extras = parse_with(TrainOptions, page, words, "train", ("capture",))
+    if extras["view"]:
+        return _train_in_view(options, run_folder(options), extras)
+    for extra in page:
+        if extras[extra.name] != extra.default:
+            raise ValueError(f"--{extra.name}: only with --view")
+    _say_trained(train_avatar(options))
     return 0
+
+
+def _train_in_view(options: "TrainOptions", folder: Path, extras: dict[str, Any]) -> int:
+    from handavatar.train.loop import train as train_avatar
+    from handavatar.view.beside import PageOptions, page_beside
+
+    place = PageOptions(folder, extras["port"], extras["host"], extras["token"])
+    with page_beside(place) as page:
+        _say_trained(train_avatar(replace(options, out=folder)))
+        page.stay()
+    return 0
+
+
+def _say_trained(run: Path) -> None:
+    print(f"run: {run}\nnext: handavatar evaluate {run}", flush=True)
 
 
 def evaluate(words: list[str]) -> int:

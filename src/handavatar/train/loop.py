@@ -30,6 +30,7 @@ from handavatar.train.appearance import (
 from handavatar.train.border import border_pixels, fit_border
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.labelled_poses import sample_points
+from handavatar.train.live import shown_live
 from handavatar.train.losses import border_loss, color_loss, occupancy_loss
 from handavatar.train.muon import Muon
 from handavatar.train.optimizer_state import (
@@ -253,7 +254,8 @@ def train(options: TrainOptions) -> Path:
     training = begin_training(capture, frames, method, options)
     training.avatar.info["view"] = view_of(frames)
     run = _open_or_create(options, capture, perceptual.name, steps)
-    with locked(run), stop_signals() as stopped, _repeatable(device):
+    live = shown_live(run, training.avatar, training.corrections, frames)
+    with locked(run), stop_signals() as stopped, live, _repeatable(device):
         checkpoint = latest_checkpoint(run)
         outlines = _fit_or_restore_outlines(run, checkpoint, training, frames, method, options)
         # Before the checkpoint is loaded: the samples are those of the geometry as it is now.
@@ -283,7 +285,7 @@ def train(options: TrainOptions) -> Path:
                     _save(run, training, outlines, step)
                 if stopped() and not is_last:
                     raise Interrupted(f"stopped at step {step}; continue with --resume auto")
-    training.avatar.save(run.avatar)
+        training.avatar.save(run.avatar)
     return run.folder
 
 
@@ -644,17 +646,23 @@ def _clear_gradients(training: Training) -> None:
         optimizer.zero_grad(set_to_none=True)
 
 
+def run_folder(options: TrainOptions) -> Path:
+    """Where a training with these options goes on, or begins: ``out``, if that is given."""
+    if options.out is not None:
+        return options.out
+    if options.resume == "auto":
+        begun = latest_run_folder(options.capture, options.method)
+        if begun is not None and not (begun / "avatar.safetensors").exists():
+            return begun
+    return default_run_folder(options.capture, options.method)
+
+
 def _open_or_create(options: TrainOptions, capture: Capture, perceptual: str, steps: int) -> Run:
-    folder = options.out
-    if folder is None and options.resume == "auto":
-        folder = latest_run_folder(options.capture, options.method)
-        if folder is not None and (folder / "avatar.safetensors").exists():
-            folder = None
-    if folder is not None and options.resume == "auto" and (folder / "run.json").exists():
+    folder = run_folder(options)
+    if options.resume == "auto" and (folder / "run.json").exists():
         run = open_run(folder)
         _require_same_training(run, options, capture)
         return run
-    folder = folder or default_run_folder(options.capture, options.method)
     record = {
         name: str(value) if isinstance(value, Path) else value
         for name, value in asdict(options).items()

@@ -8,10 +8,12 @@ import math
 import sys
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from io import TextIOBase
 from types import TracebackType
-from typing import IO, cast
+from typing import IO, Any, cast
 
 from rich.console import Console
 from rich.live import Live
@@ -21,6 +23,23 @@ _SPEED_WINDOW = 30.0
 """Seconds over which the speed is averaged."""
 _LINE_EVERY = 10.0
 """Seconds between JSON lines; the live line is drawn four times a second."""
+
+Listener = Callable[[dict[str, Any], bool], None]
+"""Is told a job's state, as its JSON line has it, at every step; and whether it begins or ends."""
+_LISTENER: ContextVar[Listener | None] = ContextVar("listener", default=None)
+
+
+@contextmanager
+def told_to(listener: Listener) -> Iterator[None]:
+    """While it lasts, all progress of this thread is told to a listener, too.
+
+    As with standard error, the jobs need not know who reads.
+    """
+    token = _LISTENER.set(listener)
+    try:
+        yield
+    finally:
+        _LISTENER.reset(token)
 
 
 class Progress:
@@ -62,6 +81,7 @@ class Progress:
             console = Console(file=self._stream)
             self._live = Live(self._text(), console=console, refresh_per_second=4, transient=False)
             self._live.start()
+        self._tell(True)
         return self
 
     def __exit__(
@@ -76,6 +96,7 @@ class Progress:
             self._live.stop()
         else:
             self._write_line()
+        self._tell(True)
 
     def update(self, step: int, note: str = "", /, **figures: float) -> None:
         """Says that ``step`` steps are done.
@@ -96,6 +117,7 @@ class Progress:
         elif now - self._last_line >= _LINE_EVERY:
             self._last_line = now
             self._write_line()
+        self._tell(False)
 
     @property
     def steps_per_second(self) -> float:
@@ -116,8 +138,15 @@ class Progress:
         parts += [self._note] if self._note else []
         return Text("   ".join(parts), no_wrap=True, overflow="ellipsis")
 
+    def _tell(self, is_turning_point: bool) -> None:
+        if (listener := _LISTENER.get()) is not None:
+            listener(self._record(), is_turning_point)
+
     def _write_line(self) -> None:
-        record: dict[str, object] = {
+        print(json.dumps(self._record()), file=self._stream, flush=True)
+
+    def _record(self) -> dict[str, Any]:
+        record: dict[str, Any] = {
             "job": self._job,
             "step": self._step,
             "total": self._total,
@@ -128,7 +157,7 @@ class Progress:
             record["note"] = self._note
         for name, value in self._figures.items():
             record[name] = round(value, 4) if math.isfinite(value) else None
-        print(json.dumps(record), file=self._stream, flush=True)
+        return record
 
 
 def duration(seconds: float) -> str:

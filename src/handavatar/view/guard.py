@@ -15,6 +15,9 @@ from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
 LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
+PICTURE_KIND = "image/png"
+"""What a page may send besides JSON: like it, no foreign form can without asking first."""
+_PICTURE_PATH = "/paint"
 _MOST_TOKEN = 200
 
 
@@ -68,8 +71,8 @@ class Guard:
         if self.token and not self._is_token(given_token(target, headers, self.cookie)):
             raise Refused(401, "open the address with its token, as the terminal prints it")
         kind = headers.get("Content-Type", "").partition(";")[0].strip().lower()
-        if method == "POST" and kind != "application/json":
-            raise Refused(415, "expected application/json")
+        if method == "POST" and kind != kind_expected(target):
+            raise Refused(415, f"expected {kind_expected(target)}")
 
     def _is_own_name(self, name: str) -> bool:
         if is_loopback(self.host):
@@ -79,6 +82,11 @@ class Guard:
 
     def _is_token(self, given: str) -> bool:
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode("utf-8"))
+
+
+def kind_expected(target: str) -> str:
+    """The media type of what is posted to an address."""
+    return PICTURE_KIND if target == _PICTURE_PATH else "application/json"
 
 
 def guard_of(host: str, token: str) -> Guard:

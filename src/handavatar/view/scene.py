@@ -72,6 +72,17 @@ class Stroke:
 
 
 @dataclass(frozen=True)
+class Coat:
+    """A picture laid on all the skin, as ``--paint`` lays it.
+
+    Attributes:
+        picture: by the name that the viewer gave it when it was sent.
+    """
+
+    picture: str
+
+
+@dataclass(frozen=True)
 class Touches:
     """The edits of a page, whole: they take the place of the avatar's own.
 
@@ -79,13 +90,13 @@ class Touches:
         light_gain: multiplies the illumination.
         albedo_shift: added to the albedo, RGB in [-1, 1].
         lifted_bones: bones that cast no shadow.
-        strokes: over what paint the avatar has, later ones on top.
+        strokes: dabs and pictures, over what paint the avatar has, later ones on top.
     """
 
     light_gain: float = 1.0
     albedo_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     lifted_bones: tuple[int, ...] = ()
-    strokes: tuple[Stroke, ...] = ()
+    strokes: tuple[Stroke | Coat, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -111,6 +122,21 @@ class Scene:
     layer: str = "rgb"
     size: int = 256
     touches: Touches = Touches()
+
+
+@dataclass(frozen=True)
+class View:
+    """What is to be seen of a training.
+
+    Attributes:
+        frame: number among the training frames.
+        layer: one of ``LAYERS``.
+        size: pixels along a side.
+    """
+
+    frame: int
+    layer: str
+    size: int
 
 
 def read_json(body: bytes) -> dict[str, Any]:
@@ -146,17 +172,28 @@ def read_scene(content: Any) -> Scene:
         if len(angles) != NUM_BONES:
             raise SceneError(f"angles: expected {NUM_BONES} rows, found {len(angles)}")
     moment = given.get("moment")
-    size = whole(given.get("size", 256), "size", SIZES[0], SIZES[-1])
-    if size not in SIZES:
-        raise SceneError(f"size: expected one of {SIZES}, found {size}")
     return Scene(
         None if moment is None else read_moment(moment),
         angles,
         _degrees(given.get("turn", [0, 0, 0]), "turn"),
         _orbit(given.get("orbit", {})),
         _word(given.get("layer", "rgb"), "layer", LAYERS),
-        size,
+        _size(given.get("size", 256)),
         read_touches(given.get("touches", {})),
+    )
+
+
+def read_view(content: Any) -> View:
+    """What a page wants to see of a training; what it leaves out is as by default.
+
+    Raises:
+        SceneError: what is wrong with it.
+    """
+    given = fields(content, "view", ("frame", "layer", "size"))
+    return View(
+        whole(given.get("frame", 0), "frame", 0, MOST_STEPS),
+        _word(given.get("layer", "rgb"), "layer", LAYERS),
+        _size(given.get("size", 256)),
     )
 
 
@@ -234,6 +271,13 @@ def whole(value: Any, name: str, least: int, greatest: int) -> int:
     return value
 
 
+def _size(value: Any) -> int:
+    size = whole(value, "size", SIZES[0], SIZES[-1])
+    if size not in SIZES:
+        raise SceneError(f"size: expected one of {SIZES}, found {size}")
+    return size
+
+
 def _orbit(content: Any) -> Orbit:
     given = fields(content, "orbit", ("azimuth", "elevation", "zoom", "shift"))
     shift = _list(given.get("shift", [0, 0]), "shift", 2)
@@ -247,7 +291,12 @@ def _orbit(content: Any) -> Orbit:
     )
 
 
-def _stroke(content: Any) -> Stroke:
+def _stroke(content: Any) -> Stroke | Coat:
+    if isinstance(content, dict) and "picture" in content:
+        name = fields(content, "stroke", ("picture",))["picture"]
+        if not isinstance(name, str) or not 0 < len(name) <= _NAME_LENGTH:
+            raise SceneError(f"picture: expected a name, found {_short(name)}")
+        return Coat(name)
     given = fields(content, "stroke", ("anchor", "radius", "color"))
     return Stroke(
         whole(given.get("anchor"), "anchor", 0, MOST_ANCHORS),

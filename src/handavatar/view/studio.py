@@ -8,6 +8,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from handavatar.animate import camera_on, pass_pictures
 from handavatar.avatar import HandAvatar, Rendering, RenderSettings
+from handavatar.capture.checks import CaptureError, picture_in
 from handavatar.capture.motion import (
     MORE_GESTURES,
     MOTIONS,
@@ -41,15 +43,31 @@ from handavatar.hand.pose_sampling import (
     rotations_from_angles,
 )
 from handavatar.render.shaded import shaded_mesh
+from handavatar.retouch import paint_of
 from handavatar.view.baked import BakedAvatar, dabbed
-from handavatar.view.scene import LAYERS, SIZES, Moment, Orbit, Scene, SceneError, Stroke, Touches
+from handavatar.view.scene import (
+    LAYERS,
+    SIZES,
+    Coat,
+    Moment,
+    Orbit,
+    Scene,
+    SceneError,
+    Stroke,
+    Touches,
+)
 
 STAGES = ("fluid", "half", "full")
 FLUID_SIZE = 256
 """The fluid picture has at most so many pixels along a side."""
 MOST_SAVED = 100
 Pixels = UInt8[np.ndarray, "size size 3"]
+MOST_PICTURE_BYTES = 4 * 2**20
+"""Of a picture that is sent as paint."""
+MOST_PICTURE_PIXELS = 4096 * 4096
+"""Of a picture that is sent as paint; decoded it takes four bytes a pixel."""
 _KEPT_PAINTS = 8
+_KEPT_COATS = 64
 
 
 class Interrupted(Exception):
@@ -108,6 +126,8 @@ class Studio:
         self._baked = BakedAvatar(copy.deepcopy(self._avatar), self._first)
         self._places, self._normals = self._baked.template_anchors()
         self._paints: OrderedDict[tuple[Any, ...], Paint | None] = OrderedDict()
+        self._coats: OrderedDict[str, Paint] = OrderedDict()
+        self._reading_coat = threading.Lock()
 
     def about(self) -> dict[str, Any]:
         """What a page needs to know, as JSON; angles in degrees."""
@@ -133,6 +153,7 @@ class Studio:
             "layers": list(LAYERS),
             "sizes": list(SIZES),
             "stages": list(STAGES),
+            "most_picture_bytes": MOST_PICTURE_BYTES,
             "joints": joints,
             "fingers": list(FINGER_BONES),
             "angles": self.angles(None),
@@ -176,7 +197,7 @@ class Studio:
         """What the renderer needs for a scene.
 
         Raises:
-            SceneError: if the scene names a moment or an anchor that there is not.
+            SceneError: if the scene names a moment, an anchor or a picture that there is not.
         """
         return Shot(self.pose(scene), self._camera(scene), self.edit(scene.touches))
 
@@ -201,7 +222,7 @@ class Studio:
         """The edit that a page's touches make of the untouched avatar.
 
         Raises:
-            SceneError: if a stroke lies on an anchor that there is not.
+            SceneError: if a stroke lies on an anchor, or is a picture, that there is not.
         """
         return Edit(
             touches.light_gain, touches.albedo_shift, touches.lifted_bones, self._paint(touches)
@@ -215,7 +236,8 @@ class Studio:
         """
         shot = self.shot(replace(scene, size=min(scene.size, FLUID_SIZE)))
         if scene.layer == "mesh":
-            return self._mesh(self._baked.posed(shot.pose).posed.vertices, shot.camera, 1)
+            vertices = self._baked.posed(shot.pose).posed.vertices
+            return mesh_picture(vertices, self._avatar, shot, 1)
         rendering = self._baked.render(shot.pose, shot.camera, shot.edit)
         return pass_pictures(rendering, self.side)[scene.layer]
 
@@ -234,26 +256,10 @@ class Studio:
         is_full = stage == STAGES[-1]
         shot = self.shot(scene if is_full else replace(scene, size=scene.size // 2))
         if scene.layer == "mesh":
-            pose = shot.pose.to(self._avatar.device)
-            with torch.no_grad():
-                vertices = self._avatar.personal(pose).posed(pose).vertices
-            return self._mesh(vertices, shot.camera, 2)
-        fast = replace(
-            self._settings, num_samples=self._settings.num_samples // 2 or 1, edge_rays=1
-        )
-        rendering = self.rendering(shot, self._settings if is_full else fast, is_stale)
+            return mesh_picture(posed_vertices(self._avatar, shot), self._avatar, shot, 2)
+        settings = self._settings if is_full else at_half(self._settings)
+        rendering = rendered(self._avatar, shot, settings, is_stale)
         return pass_pictures(rendering, self.side)[scene.layer]
-
-    def rendering(
-        self, shot: Shot, settings: RenderSettings, is_stale: Callable[[], bool]
-    ) -> Rendering:
-        """:meth:`HandAvatar.render` of a shot, which ends as soon as it is stale.
-
-        Raises:
-            Interrupted: then.
-        """
-        with _interruptible(self._avatar, is_stale):
-            return self._avatar.render(shot.pose, shot.camera, shot.edit, settings)
 
     def nearest_anchor(self, scene: Scene, x: float, y: float) -> int | None:
         """The anchor under a point of the picture; None beside the hand.
@@ -268,6 +274,32 @@ class Studio:
         column, row = (min(int(share * scene.size), scene.size - 1) for share in (x, y))
         return self._baked.nearest_anchor(shot.pose, shot.camera, column, row)
 
+    def coat(self, content: bytes) -> str:
+        """Reads a picture as paint, and gives the name by which scenes may have it.
+
+        The last few are kept; the same picture has the same name.
+
+        Args:
+            content: a PNG with transparency, in the rig's texture chart.
+
+        Raises:
+            SceneError: if it is none, or too large.
+        """
+        name = sha256(content).hexdigest()[:32]
+        with self._reading_coat:
+            if name not in self._coats:
+                try:
+                    picture = picture_in(
+                        io.BytesIO(content), "the picture", ("PNG",), MOST_PICTURE_PIXELS
+                    )
+                    self._coats[name] = paint_of(picture, "the picture", self._avatar)
+                except CaptureError as error:
+                    raise SceneError(f"{error.what}: {error.remedy}") from error
+                while len(self._coats) > _KEPT_COATS:
+                    self._coats.popitem(last=False)
+            self._coats.move_to_end(name)
+        return name
+
     def save(self, touches: Touches, folder: Path) -> Path:
         """Writes the avatar with a page's edits under a new name; no file is replaced.
 
@@ -275,7 +307,7 @@ class Studio:
             ``edited-001.safetensors`` in the folder, or with the first number that is free.
 
         Raises:
-            SceneError: if a stroke lies on an anchor that there is not, or no number is free.
+            SceneError: if a stroke means nothing here, or no number is free.
         """
         edited = copy.copy(self._avatar)
         edited.edit = self.edit(touches)
@@ -329,25 +361,26 @@ class Studio:
                     self._paints.popitem(last=False)
             return self._paints[touches.strokes]
 
-    def _mixed(self, strokes: tuple[Stroke, ...]) -> Paint | None:
+    def _mixed(self, strokes: tuple[Stroke | Coat, ...]) -> Paint | None:
         paint = self.start.paint
         for stroke in strokes:
-            if stroke.anchor >= len(self._places):
-                raise SceneError(
-                    f"anchor: expected one below {len(self._places)}, found {stroke.anchor}"
-                )
-            opacity = dabbed(self._places, self._normals, stroke.anchor, stroke.radius)
-            dab = Paint(opacity.new_tensor(stroke.color).expand(len(opacity), 3), opacity)
-            paint = dab if paint is None else dab.over(paint)
+            coat = self._sent(stroke) if isinstance(stroke, Coat) else self._dab(stroke)
+            paint = coat if paint is None else coat.over(paint)
         return paint
 
-    def _mesh(self, vertices: Float[Tensor, "vertices 3"], camera: Camera, samples: int) -> Pixels:
-        with torch.no_grad():
-            shown = shaded_mesh(
-                vertices, self._avatar.rig.faces, camera.to(vertices.device), samples
+    def _sent(self, coat: Coat) -> Paint:
+        paint = self._coats.get(coat.picture)
+        if paint is None:
+            raise SceneError(f"there is no picture {coat.picture!a}: choose its file again")
+        return paint
+
+    def _dab(self, stroke: Stroke) -> Paint:
+        if stroke.anchor >= len(self._places):
+            raise SceneError(
+                f"anchor: expected one below {len(self._places)}, found {stroke.anchor}"
             )
-        pixels = eight_bits(shown.cpu()).numpy()
-        return np.ascontiguousarray(pixels[:, ::-1]) if self.side == "left" else pixels
+        opacity = dabbed(self._places, self._normals, stroke.anchor, stroke.radius)
+        return Paint(opacity.new_tensor(stroke.color).expand(len(opacity), 3), opacity)
 
     def _degrees(self, rotations: Float[Tensor, "bones 3"]) -> list[list[float]]:
         angles = angles_from_rotations(self._rig, rotations).rad2deg()
@@ -389,6 +422,48 @@ def orbiting(
         focal = (camera.focal[0] * orbit.zoom, camera.focal[1] * orbit.zoom)
         camera = replace(camera, focal=focal, center=(x, y))
     return camera
+
+
+def at_half(settings: RenderSettings) -> RenderSettings:
+    """The settings of the stage ``half``."""
+    return replace(settings, num_samples=settings.num_samples // 2 or 1, edge_rays=1)
+
+
+def rendered(
+    avatar: HandAvatar, shot: Shot, settings: RenderSettings, is_stale: Callable[[], bool]
+) -> Rendering:
+    """:meth:`HandAvatar.render` of a shot, which ends as soon as it is stale.
+
+    Raises:
+        Interrupted: then.
+    """
+    with _interruptible(avatar, is_stale):
+        return avatar.render(shot.pose, shot.camera, shot.edit, settings)
+
+
+def mesh_picture(
+    vertices: Float[Tensor, "vertices 3"], avatar: HandAvatar, shot: Shot, samples: int
+) -> Pixels:
+    """The posed mesh in grey, of so many samples a pixel's side; mirrored back if it is a left one.
+
+    Args:
+        vertices: of the shot's pose.
+        avatar: whose.
+        shot: its camera counts.
+        samples: one is fast.
+    """
+    camera = shot.camera.to(vertices.device)
+    with torch.no_grad():
+        pixels = eight_bits(shaded_mesh(vertices, avatar.rig.faces, camera, samples).cpu()).numpy()
+    is_left = avatar.info.get("side") == "left"
+    return np.ascontiguousarray(pixels[:, ::-1]) if is_left else pixels
+
+
+def posed_vertices(avatar: HandAvatar, shot: Shot) -> Float[Tensor, "vertices 3"]:
+    """Of the personal hand in the shot's pose, metres, world."""
+    pose = shot.pose.to(avatar.device)
+    with torch.no_grad():
+        return avatar.personal(pose).posed(pose).vertices
 
 
 def encoded(pixels: Pixels, kind: str) -> bytes:

@@ -16,8 +16,9 @@ let film = null;
 const scene = { moment: null, angles: null, turn: [0, 0, 0], orbit: null, layer: "rgb", size: 256, touches: null };
 
 async function ask(path, body, signal) {
+  const isFile = body instanceof Blob;
   const options = body === undefined ? { signal }
-    : { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body), signal };
+    : { method: "POST", headers: { "Content-Type": isFile ? "image/png" : "application/json" }, body: isFile ? body : JSON.stringify(body), signal };
   const answer = await fetch(path, options);
   if (answer.ok) return answer;
   let why = answer.statusText;
@@ -168,6 +169,18 @@ async function paintAt(event) {
   } finally {
     picking = false;
   }
+}
+
+async function paintPicture() {
+  const input = $("paint-picture");
+  const [file] = input.files;
+  input.value = "";  // The same file, changed meanwhile, can be chosen again.
+  if (!file) return;
+  if (file.size > about.most_picture_bytes) throw new Error(`${file.name} has ${file.size} bytes, at most ${about.most_picture_bytes} are taken`);
+  if (scene.touches.strokes.length >= 400) throw new Error("that is all the paint there is: undo some");
+  scene.touches.strokes.push(await (await ask("paint", file)).json());
+  said(`painted with ${file.name}`);
+  changed();
 }
 
 function showTouches() {
@@ -352,6 +365,7 @@ function wire() {
   on("light", "input", () => { scene.touches.light_gain = Number($("light").value); changed(); });
   ["red", "green", "blue"].forEach((name, at) => on(name, "input", () => { scene.touches.albedo_shift[at] = Number($(name).value); changed(); }));
   on("painting", "change", () => canvas.classList.toggle("painting", $("painting").checked));
+  on("paint-picture", "change", paintPicture);
   on("undo", "click", () => { scene.touches.strokes.pop(); changed(); });
   on("wipe", "click", () => { scene.touches.strokes = []; changed(); });
   on("unedit", "click", () => { scene.touches = structuredClone(about.touches); showTouches(); changed(); });

@@ -1,0 +1,237 @@
+"""``train --view`` as a person meets it: a real training, a real browser."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from source_tree import TOP
+
+from handavatar.train.runs import open_run, read_log
+
+playwright = pytest.importorskip("playwright.sync_api")
+CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or ""
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not CHROMIUM, reason="needs chromium: apt-get install chromium"),
+]
+ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+# The pages' process begins with this program as well, but is not the one to run it.
+PROGRAM = """
+import sys
+if __name__ == "__main__":
+    from conftest import TINY
+    from handavatar.train.loop import METHODS
+    METHODS["quick"] = TINY
+    from handavatar.cli import main
+    sys.exit(main(sys.argv[1:]))
+"""
+
+
+class Training:
+    """``handavatar train`` of a method of seconds, in a process of its own."""
+
+    def __init__(self, folder: Path, capture: Path, name: str, *words: str) -> None:
+        self.run = folder / name
+        (folder / "tiny.py").write_text(PROGRAM, encoding="utf-8")
+        self._out = (folder / f"{name}.out").open("w")
+        self._err = (folder / f"{name}.err").open("w")
+        options = ["--out", str(self.run), "--perceptual", "substitute", "--device", "cpu", *words]
+        here = {"PYTHONPATH": os.pathsep.join([str(TOP / "src"), str(TOP / "tests")])}
+        self.process = subprocess.Popen(
+            [sys.executable, str(folder / "tiny.py"), "train", str(capture), *options],
+            stdout=self._out,
+            stderr=self._err,
+            cwd=folder,
+            env=os.environ | here | {"OMP_NUM_THREADS": "1"},
+        )
+
+    @property
+    def out(self) -> str:
+        return Path(self._out.name).read_text(encoding="utf-8")
+
+    @property
+    def err(self) -> str:
+        return Path(self._err.name).read_text(encoding="utf-8")
+
+    def address(self, page: Any) -> str:
+        """As it is said, once it is."""
+        for _ in range(1200):
+            for line in self.err.splitlines():
+                if line.startswith("open http://"):
+                    return line.split()[1]
+            assert self.process.poll() is None, self.err
+            page.wait_for_timeout(50)
+        raise AssertionError(self.err)
+
+    def page_processes(self) -> list[int]:
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text()
+        return [
+            int(child)
+            for child in children.split()
+            if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()
+        ]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as manager:
+        running = manager.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def page(browser: Any) -> Iterator[Any]:
+    context = browser.new_context(viewport={"width": 1200, "height": 800})
+    made = context.new_page()
+    made.set_default_timeout(400_000)
+    made.strays = []
+    made.on("pageerror", lambda error: made.strays.append(str(error)))
+    yield made
+    assert made.strays == []
+    context.close()
+
+
+def is_gone(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def test_losses_and_pictures_change_and_the_page_becomes_the_viewer(
+    page: Any, tiny_capture: Path, tmp_path: Path
+) -> None:
+    steps = ("--steps", "200")
+    alone = Training(tmp_path, tiny_capture, "alone", *steps)
+    assert alone.process.wait(1800) == 0, alone.err
+    training = Training(tmp_path, tiny_capture, "seen", *steps, "--view", "--port", "0")
+    try:
+        page.goto(training.address(page))
+        page.select_option("#size", "128")
+        page.wait_for_selector("#job[data-phase=training][data-job=train]")
+        page.check("input[name=layer][value=rgb]")
+        page.wait_for_selector("#picture[data-version][data-stage='1']")
+        first = page.evaluate("[picture.toDataURL(), picture.dataset.version]")
+        assert page.locator("#frames canvas").count() == 3
+        page.wait_for_selector("[data-curve='train: loss']")
+        points = int(page.get_attribute("[data-curve='train: loss']", "data-points"))
+        assert "steps/s" in page.inner_text("#job") and "left" in page.inner_text("#job")
+
+        # Another tab that is closed in the middle of its picture.
+        other = page.context.new_page()
+        other.goto(training.address(page))
+        other.select_option("#size", "512")
+        other.select_option("#detail", "2")
+        other.wait_for_function("() => picture.width == 512")
+        other.close()
+
+        page.click("#frames canvas[data-frame='2']")
+        page.wait_for_selector("#picture[data-frame='2']")
+        assert page.get_attribute("#frame", "data-frame") == "2"
+        page.click("#frames canvas[data-frame='0']")
+        page.wait_for_function(
+            "before => picture.dataset.frame == 0 && picture.dataset.stage == 1 &&"
+            " picture.dataset.version != before[1] && picture.toDataURL() != before[0]",
+            arg=first,
+        )
+        page.wait_for_function(
+            "before => document.querySelector(\"[data-curve='train: loss']\").dataset.points"
+            " > before",
+            arg=points,
+        )
+        # It goes over by itself, and the ordinary page works.
+        page.wait_for_selector("#gesture")
+        page.wait_for_selector("canvas[data-stage=fluid], canvas[data-stage=half]")
+        page.select_option("#gesture", "fist")
+        page.wait_for_function("() => picture.dataset.order == order")
+        assert f"run: {training.run}" in training.out
+        (viewer,) = training.page_processes()
+        training.process.send_signal(signal.SIGINT)
+        assert training.process.wait(60) == 0
+        assert is_gone(viewer)
+        assert "Traceback" not in training.err and "the page has ended" not in training.err
+    finally:
+        training.process.kill()
+    ours, theirs = (one.run / "avatar.safetensors" for one in (alone, training))
+    assert ours.read_bytes() == theirs.read_bytes()
+    assert read_log(open_run(alone.run)) == read_log(open_run(training.run))
+
+
+def test_ctrl_c_ends_both_and_saves(page: Any, tiny_capture: Path, tmp_path: Path) -> None:
+    training = Training(tmp_path, tiny_capture, "run", "--steps", "100000", "--view", "--port", "0")
+    try:
+        page.goto(training.address(page))
+        page.wait_for_selector("#job[data-job=train]")
+        page.wait_for_selector("#picture[data-version]")
+        (viewer,) = training.page_processes()
+        training.process.send_signal(signal.SIGINT)
+        assert training.process.wait(120) == 130
+        assert "interrupted: stopped at step" in training.err
+        assert is_gone(viewer)
+        page.wait_for_function("() => problem.textContent.includes('does not answer')")
+        assert list((training.run / "checkpoints").glob("step-*"))
+        assert not list(training.run.glob("**/.tmp-*"))
+    finally:
+        training.process.kill()
+
+
+def test_a_killed_page_is_said_and_training_goes_on(
+    page: Any, tiny_capture: Path, tmp_path: Path
+) -> None:
+    training = Training(tmp_path, tiny_capture, "run", "--steps", "60", "--view", "--port", "0")
+    try:
+        page.goto(training.address(page))
+        (viewer,) = training.page_processes()
+        os.kill(viewer, signal.SIGKILL)
+        assert training.process.wait(300) == 0  # Nothing is left to stay for.
+        assert "the page has ended (exit code -9)" in training.err
+        assert (training.run / "avatar.safetensors").is_file()
+    finally:
+        training.process.kill()
+
+
+def test_a_killed_trainer_takes_its_page_along_and_view_looks_on_at_another(
+    page: Any, tiny_capture: Path, tmp_path: Path
+) -> None:
+    training = Training(tmp_path, tiny_capture, "run", "--steps", "100000", "--view", "--port", "0")
+    words = ["view", str(training.run), "--port", "0"]
+    watching = None
+    try:
+        page.goto(training.address(page))
+        page.wait_for_selector("#job[data-job=train]")
+        (viewer,) = training.page_processes()
+        # `handavatar view` of a run that is being trained looks on as well.
+        watching = subprocess.Popen(
+            [sys.executable, "-m", "handavatar", *words],
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"PYTHONPATH": str(TOP / "src")},
+        )
+        assert watching.stdout is not None
+        other = page.context.new_page()
+        other.set_default_timeout(400_000)
+        other.goto(watching.stdout.readline().split()[1])
+        other.wait_for_selector("#picture[data-version]")
+        training.process.kill()
+        training.process.wait()
+        other.wait_for_selector("#job[data-phase=stopped]")
+        assert "has stopped" in other.inner_text("#job")
+        for _ in range(200):
+            if is_gone(viewer):
+                break
+            page.wait_for_timeout(50)
+        assert is_gone(viewer)
+        watching.send_signal(signal.SIGINT)
+        assert watching.wait(60) == 0
+    finally:
+        training.process.kill()
+        if watching is not None:
+            watching.kill()
