@@ -22,10 +22,10 @@ from torch import Tensor
 
 from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chosen_device
 from handavatar.capture.motion import open_motion
-from handavatar.capture.view import start_of
+from handavatar.capture.view import camera_holding, start_of
 from handavatar.edit import Edit
 from handavatar.field.kernels import Kernel, chosen_kernel
-from handavatar.geometry.cameras import Camera, look_at, project
+from handavatar.geometry.cameras import Camera
 from handavatar.geometry.colors import eight_bits
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
@@ -256,23 +256,10 @@ def camera_on(avatar: HandAvatar, poses: list[HandPose], size: int) -> Camera:
         poses: to be held.
         size: pixels along a side.
     """
-    view = avatar.info.get("view")
-    if view is None:
-        middle = _middle(avatar, poses[0])
-        placed = look_at(
-            middle + torch.tensor([0.0, -0.6, 0.0]), middle, torch.tensor([-1.0, 0, 0])
-        )
-    else:
-        placed = torch.tensor(view["camera_from_world"])
-    wide = Camera((1.0, 1.0), (0.0, 0.0), 1, 1, placed)
     with torch.no_grad():
         rest = avatar.rig.to("cpu").shaped(avatar.coefficients.cpu())
-        seen = torch.cat([project(wide, rest.posed(pose).vertices)[0] for pose in poses])
-    lower, upper = seen.amin(0), seen.amax(0)
-    side = float((upper - lower).max()) * 1.15
-    left, top = ((lower + upper) / 2 - side / 2).tolist()
-    focal = size / side
-    return Camera((focal, focal), (-left * focal, -top * focal), size, size, placed)
+        points = torch.cat([rest.posed(pose).vertices for pose in poses])
+    return camera_holding(avatar.info.get("view"), points, _middle(avatar, poses[0]), size)
 
 
 def orbited(camera: Camera, center: Tensor, angle: float) -> Camera:
