@@ -80,27 +80,38 @@ def fit_correctives(samples: FieldSamples, hand: ShapedHand) -> PoseCorrectives:
     """
     coarse = samples.surface.shape[1]
     normals = vertex_normals(hand.rig.sealed(hand.rest_vertices), hand.rig.sealed_faces)[:coarse]
-    mean = samples.surface.nanmean(0).nan_to_num(0)
-    outwards = torch.where(samples.surface.isnan(), mean, samples.surface)
-    vertices = samples.rest_vertices + outwards[..., None] * normals
-    found = torch.cat([vertices.flatten(1), samples.rest_joints.flatten(1)], dim=1).double()
-    middle = found.mean(0)
-    features = pose_features(samples.rotations).double()
-    features = torch.cat([features, torch.ones_like(features[:, :1])], dim=1)
-    damping = _DAMPING * torch.eye(features.shape[1], dtype=torch.float64)
-    damping[-1, -1] = 0
-    normal = features.T @ features + damping
-    driven = torch.linalg.solve(normal, features.T @ (found - middle))
-    # What the pose explains, in the fewest shapes.
-    _, strength, shapes = torch.linalg.svd(features @ driven, full_matrices=False)
-    count = min(NUM_SHAPES, len(strength))
-    shapes = shapes[:count]
-    weights = driven @ shapes.T
     split = 3 * coarse
+    features = pose_features(samples.rotations)
+    rest = torch.cat([samples.rest_vertices.flatten(1), samples.rest_joints.flatten(1)], dim=1)
+    middle, driven = _driven(features, rest)
+    is_known = samples.surface.isfinite().any(1)
+    if bool(is_known.any()):
+        found = samples.surface[is_known]
+        mean = found.nanmean(0).nan_to_num(0)
+        outwards = torch.where(found.isfinite(), found, mean)
+        farther, driven_farther = _driven(features[is_known], outwards)
+        middle[:split] += (farther[:, None] * normals).flatten()
+        driven[:, :split] += (driven_farther[..., None] * normals).flatten(1)
+    # What the pose explains, in the fewest shapes.
+    explained = torch.cat([features, torch.ones_like(features[:, :1])], dim=1).double() @ driven
+    shapes = torch.linalg.svd(explained, full_matrices=False).Vh[:NUM_SHAPES]
     return PoseCorrectives(
         middle[:split].view(-1, 3).float(),
         middle[split:].view(-1, 3).float(),
         shapes[:, :split].unflatten(1, (-1, 3)).float(),
         shapes[:, split:].unflatten(1, (-1, 3)).float(),
-        weights.T.float(),
+        (driven @ shapes.T).T.float(),
     )
+
+
+def _driven(
+    features: Float[Tensor, "poses features"], values: Float[Tensor, "poses columns"]
+) -> tuple[Float[Tensor, "columns"], Float[Tensor, "features_and_one columns"]]:
+    """Means of values over poses, and by ridge regression what drives them away from these."""
+    features = torch.cat([features, torch.ones_like(features[:, :1])], dim=1).double()
+    values = values.double()
+    damping = _DAMPING * torch.eye(features.shape[1], dtype=torch.float64)
+    damping[-1, -1] = 0
+    mean = values.mean(0)
+    normal = features.T @ features + damping
+    return mean, torch.linalg.solve(normal, features.T @ (values - mean))

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar
+from handavatar.capture.motion import MORE_GESTURES, gesture
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
 from handavatar.field.anchors import nearest_anchors
@@ -17,7 +18,12 @@ from handavatar.field.occupancy import HandCodes
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.pose import FINGER_BONES, NUM_BONES, HandPose
-from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
+from handavatar.hand.pose_sampling import (
+    GESTURES,
+    interpolate_rotations,
+    resolve_penetration,
+    sample_poses,
+)
 
 NUM_POINTS = 2048
 """Vertices, drawn anew in every pose, whose light is looked up."""
@@ -28,10 +34,14 @@ _REACH = 4e-3
 _HALVINGS = 6
 _TURN = 0.45
 """Standard deviation of the wrist's turn about each axis, radians, away from the capture's view."""
-_ANYWHERE = 4
-"""Every so many poses the wrist takes any orientation."""
+_ANYWHERE = 5
+"""Every so many turns the wrist takes any orientation."""
+_OUTLINES = 3
+"""The outline, which takes half of the time, is looked for in every so many poses."""
 _TRACED_LIFTS = 3
 """Where light is traced, which takes seconds, shadows are lifted in every so many poses."""
+_TURNS = 4
+"""Orientations of the wrist in each pose of the fingers; one, where light is traced."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +53,7 @@ class FieldSamples:
         rest_vertices: of the personal hand before subdivision, what the pose adds included, metres.
         rest_joints: metres.
         surface: how far outside each of these vertices the field's outline lies, along the normal,
-            metres; NaN where it is not found, as between fingers that touch.
+            metres; NaN where it is not found, as between fingers that touch, or not looked for.
         points: vertices of the fine mesh whose light is known.
         light: illumination there.
         lifted: bones whose shadow is lifted in another look at the same pose.
@@ -66,23 +76,36 @@ class FieldSamples:
 
 def sampled_poses(
     avatar: HandAvatar, count: int, generator: torch.Generator
-) -> Float[Tensor, "count bones 3"]:
-    """Random poses as hands take them, turned in the light about as the capture's hand was."""
-    fingers = resolve_penetration(avatar.base_rig, sample_poses(avatar.base_rig, count, generator))
-    near = _TURN * torch.randn(count, 3, generator=generator)
-    angle = math.pi * torch.rand(count, 1, generator=generator)
-    axis = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=-1)
-    is_anywhere = (torch.arange(count) % _ANYWHERE == _ANYWHERE - 1)[:, None]
-    turns = matrix_from_axis_angle(torch.where(is_anywhere, angle * axis, near))
+) -> Float[Tensor, "count turns bones 3"]:
+    """Poses as hands take them, each turned in the light in a few ways.
+
+    Every other one is random, the others lie on the way from one gesture to another. The wrist is
+    about where the capture had it, and sometimes anywhere.
+    """
+    rig = avatar.base_rig
+    fingers = sample_poses(rig, count, generator)
+    names = [*GESTURES, *MORE_GESTURES]
+    for number in range(1, count, 2):
+        first, second = torch.randint(len(names), (2,), generator=generator).tolist()
+        keys = torch.stack([gesture(rig, names[first]), gesture(rig, names[second])])
+        fingers[number] = interpolate_rotations(keys, torch.rand(1, generator=generator))[0]
+    fingers = resolve_penetration(rig, fingers)
+    turns = 1 if _is_traced(avatar) else _TURNS
+    total = count * turns
+    near = _TURN * torch.randn(total, 3, generator=generator)
+    angle = math.pi * torch.rand(total, 1, generator=generator)
+    axis = torch.nn.functional.normalize(torch.randn(total, 3, generator=generator), dim=-1)
+    is_anywhere = (torch.arange(total) % _ANYWHERE == _ANYWHERE - 1)[:, None]
+    away = matrix_from_axis_angle(torch.where(is_anywhere, angle * axis, near))
     start = matrix_from_axis_angle(start_of(avatar.info.get("view")).rotations[0])
-    wrists = axis_angle_from_matrix(start @ turns)
-    return torch.cat([wrists[:, None], fingers[:, 1:]], dim=1)
+    wrists = axis_angle_from_matrix(start @ away).view(count, turns, 1, 3)
+    return torch.cat([wrists, fingers[:, None, 1:].expand(-1, turns, -1, -1)], dim=2)
 
 
 @torch.no_grad()
 def sample_field(
     avatar: HandAvatar,
-    rotations: Float[Tensor, "poses bones 3"],
+    rotations: Float[Tensor, "poses turns bones 3"],
     generator: torch.Generator,
     tell: Callable[[int], None] = lambda number: None,
     num_points: int = NUM_POINTS,
@@ -91,57 +114,69 @@ def sample_field(
 
     Args:
         avatar: on the CPU; its own edit plays no part.
-        rotations: of the poses.
+        rotations: of the poses; those in a row differ in the wrist alone, and what surrounds a
+            place of the skin is looked up for all of them at once.
         generator: draws points and lifted fingers.
         tell: called with the number of every pose that is done.
         num_points: drawn per pose.
+
+    Returns:
+        All turns of the first pose, all of the second, and so on.
     """
     plain = copy.copy(avatar)
     plain.edit = Edit()
-    rows = []
+    rows: list[tuple[Tensor, ...]] = []
     for number, turned in enumerate(rotations):
-        rows.append(_in_pose(plain, turned, number, num_points, generator))
+        rows += _in_pose(plain, turned, number, num_points, generator)
         tell(number)
     columns = [torch.stack(column) for column in zip(*rows, strict=True)]
-    return FieldSamples(rotations, *columns)
+    return FieldSamples(rotations.flatten(0, 1), *columns)
 
 
 def _in_pose(
     avatar: HandAvatar,
-    rotations: Float[Tensor, "bones 3"],
+    turns: Float[Tensor, "turns bones 3"],
     number: int,
     num_points: int,
     generator: torch.Generator,
-) -> tuple[Tensor, ...]:
-    pose = HandPose(rotations, torch.zeros(3))
+) -> list[tuple[Tensor, ...]]:
+    """A row of :class:`FieldSamples` for each turn."""
+    pose = HandPose(turns[0], torch.zeros(3))
     own = avatar.coarse_personal(pose)
+    rest = own.rest_vertices + avatar.coarse_rig.pose_offsets(turns[0])
     state = avatar.prepare(pose)
     vertices = state.posed.vertices
-    surface = _outline(avatar, state.codes, vertices)
+    surface = torch.full_like(rest[:, 0], torch.nan)
+    if number % _OUTLINES == 1:
+        surface = _outline(avatar, state.codes, vertices)
     points = torch.randperm(len(vertices), generator=generator)[:num_points]
     near = nearest_anchors(state.anchors, vertices[points])
     around = avatar.occupancy(state.codes, vertices[points]).soft_parts
-    normals = near.interpolated(state.anchor_normals)
-    fingers = torch.randperm(len(FINGER_BONES), generator=generator)[: 1 + (number % 3 == 0)]
-    is_traced = avatar.illumination.chosen.num_directions > 0
+    fingers = list(FINGER_BONES.values())
+    chosen = torch.randperm(len(fingers), generator=generator)[: 1 + (number % 3 == 0)]
     lifted = torch.zeros(NUM_BONES, dtype=torch.bool)
-    if not is_traced or number % _TRACED_LIFTS == 0:
-        bones_of = list(FINGER_BONES.values())
-        for finger in fingers.tolist():
-            lifted[list(bones_of[finger])] = True
+    if not _is_traced(avatar) or number % _TRACED_LIFTS == 0:
+        for finger in chosen.tolist():
+            lifted[list(fingers[finger])] = True
     bones = tuple(lifted.nonzero()[:, 0].tolist())
-    looks = [(Edit(), state.light)]
-    if bones:
-        traced = avatar.prepare(pose, bones).light if is_traced else state.light
-        looks.append((Edit(lifted_bones=bones), traced))
-    lights = [
-        avatar.illumination(
-            rotations, near, edit.of_directed(around), normals, near.interpolated(light)
-        )
-        for edit, light in looks
-    ]
-    rest = own.rest_vertices + avatar.coarse_rig.pose_offsets(rotations)
-    return rest, own.rest_joints, surface, points, lights[0], lifted, lights[-1]
+    rows: list[tuple[Tensor, ...]] = []
+    for which, rotations in enumerate(turns):
+        turn = matrix_from_axis_angle(rotations[0]) @ matrix_from_axis_angle(turns[0, 0]).T
+        normals = near.interpolated(state.anchor_normals) @ turn.T
+        lights = []
+        for lift in dict.fromkeys(((), bones)):
+            traced = state.light
+            if _is_traced(avatar) and (lift or which > 0):
+                traced = avatar.prepare(HandPose(rotations, torch.zeros(3)), lift).light
+            seen = Edit(lifted_bones=lift).of_directed(around)
+            light = avatar.illumination(rotations, near, seen, normals, near.interpolated(traced))
+            lights.append(light)
+        rows.append((rest, own.rest_joints, surface, points, lights[0], lifted, lights[-1]))
+    return rows
+
+
+def _is_traced(avatar: HandAvatar) -> bool:
+    return avatar.illumination.chosen.num_directions > 0
 
 
 def _outline(

@@ -34,9 +34,9 @@ from handavatar.geometry.meshes import Subdivision, subdivision_levels, vertex_n
 from handavatar.hand.rig import ShapedHand
 from handavatar.hand.sparse_skin import SparseSkin
 
-NUM_POSES = 240
-"""Of them one in six is held out."""
-_HELD_OUT = 6
+NUM_POSES = 420
+"""Poses of the fingers; of them one in seven is held out."""
+_HELD_OUT = 7
 Tell = Callable[[str, int, int], None]
 """Hears what is being done, how many steps of it are done, and of how many."""
 
@@ -46,7 +46,7 @@ class Effort:
     """How much is spent on a lightweight hand.
 
     Attributes:
-        poses: in which the fields are looked up.
+        poses: of the fingers, in which the fields are looked up.
         steps: of the shading network's fit.
     """
 
@@ -144,6 +144,7 @@ def lightweight_hand(
         lambda number: tell("fields", number + 1, effort.poses),
     )
     is_held_out = torch.arange(effort.poses) % _HELD_OUT == 0
+    is_held_out = is_held_out.repeat_interleave(rotations.shape[1])
     known, held_out = samples.chosen(~is_held_out), samples.chosen(is_held_out)
     correctives = stored_correctives(fit_correctives(known, hand))
     rest = on_fine_mesh(correctives.vertices, levels)
