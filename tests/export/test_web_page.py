@@ -271,13 +271,13 @@ def test_layers_and_edits_are_as_the_avatar_has_them(page: Any, avatar: HandAvat
     color = shot(page, pose, camera)
     # The outline's pixels are covered in part.
     inside = ndimage.binary_erosion(albedo.sum(-1) > 0, iterations=2)
-    np.testing.assert_allclose(color[inside], (albedo * light)[inside], atol=0.02)
+    # And so are those where a finger ends before another.
+    assert np.quantile(np.abs(color - albedo * light)[inside], 0.98) < 0.01
     half = shot(page, pose, camera, gain=0.5)
     np.testing.assert_allclose(half, color / 2, atol=0.01)
     redder = shot(page, pose, camera, "albedo", shift=[0.2, 0, 0])
-    np.testing.assert_allclose(
-        redder[inside], np.clip(albedo + np.array([0.2, 0, 0]), 0, 1)[inside], atol=0.02
-    )
+    expected = np.clip(albedo + np.array([0.2, 0, 0]), 0, 1)
+    assert np.quantile(np.abs(redder - expected)[inside], 0.98) < 0.01
     normal = shot(page, pose, camera, "normal")
     assert normal[32, 32, 1] > 0.9  # The back of the hand looks up, to the camera.
 
@@ -424,7 +424,7 @@ def tracked(
     return {
         name: {
             "place": joint[:3, 3].tolist(),
-            "quaternion": quaternion_from_matrix(joint[:3, :3]).tolist(),
+            "quaternion": quaternion_from_matrix(joint[:3, :3]).roll(-1).tolist(),
         }
         for name, joint in zip(skeleton.names, joints, strict=True)
     }

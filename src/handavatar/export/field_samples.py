@@ -25,7 +25,7 @@ from handavatar.hand.pose_sampling import (
     sample_poses,
 )
 
-NUM_POINTS = 2048
+NUM_POINTS = 1024
 """Vertices, drawn anew in every pose, whose light is looked up."""
 OUTLINE = 0.15
 """Occupancy where a ray that grazes the skin turns opaque: it passes several samples like that."""

@@ -24,7 +24,7 @@ from handavatar.hand.rig import PosedHand, ShapedHand
 NUM_LATENTS = 8
 WIDTH = 32
 POSE_WIDTH = 32
-STEPS = 2000
+STEPS = 3000
 _POSES, _POINTS = 16, 512
 """Per step of the fit."""
 _LR, _DECAY = 1e-2, 1e-2
