@@ -6,8 +6,8 @@
 FOLDER is what `handavatar export AVATAR web --out FOLDER` wrote. Ten novel poses: four random ones
 that the export has not seen, where the capture's hand was; six steps of the motion `gestures`, two
 of them from other sides; and of two of those once more with a lifted shadow. Prints for each, and
-as means, the PSNR (decibels, whole picture on black), that of the pixels which both cover, the IoU
-of the outlines, and how fast the page is in this browser.
+as means, the PSNR (decibels, whole picture on black) and that of the pixels which both cover, and
+how fast the page is in this browser.
 """
 
 import argparse
@@ -123,13 +123,8 @@ def measure(avatar: HandAvatar, folder: Path, size: int, picture: Path | None) -
         rendered = avatar.render(shot.pose, shot.camera, Edit(lifted_bones=shot.lifted))
         truth = rendered.color.clamp(0, 1)
         error = (seen - truth).square().mean(-1)
-        covered, hand = seen.sum(-1) > 0, rendered.alpha > 0.5
-        both = covered & (rendered.alpha > 0.99)
-        rows[shot.name] = {
-            "psnr": _decibels(error),
-            "inside_psnr": _decibels(error[both]),
-            "iou": float((covered & hand).sum() / (covered | hand).sum()),
-        }
+        both = (seen.sum(-1) > 0) & (rendered.alpha > 0.99)
+        rows[shot.name] = {"psnr": _decibels(error), "inside_psnr": _decibels(error[both])}
         strips.append(torch.cat([truth, seen], 0))
         print(shot.name, json.dumps({name: round(v, 3) for name, v in rows[shot.name].items()}))
     if picture is not None:

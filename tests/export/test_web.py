@@ -15,9 +15,11 @@ import torch
 from handavatar import cli
 from handavatar.avatar import HandAvatar
 from handavatar.edit import Edit
-from handavatar.export import lightweight, run, web
+from handavatar.export import run, web
 from handavatar.export.lightweight import Effort, LightweightHand, lightweight_hand
 from handavatar.export.web import LARGEST, SCRIPTS, facts, web_files
+from handavatar.field.shading import TracedCues
+from handavatar.hand.rig import Rig
 
 PAGE = Path(run.__file__).parent / "page"
 
@@ -199,5 +201,7 @@ def test_the_page_s_joints_are_named_as_webxr_names_them(
         assert float(torch.det(matrix)) == pytest.approx(1, abs=1e-5)
 
 
-def test_the_effort_holds_poses_out() -> None:
-    assert lightweight.NUM_POSES == Effort().poses >= 100
+def test_the_whole_effort_is_that_of_the_documents(small_avatar: HandAvatar, rig: Rig) -> None:
+    traced = HandAvatar(rig, torch.zeros(10), rounds=0, num_anchors=16, cues=TracedCues(4))
+    assert Effort.for_avatar(small_avatar) == Effort(420, 3000)
+    assert Effort.for_avatar(traced) == Effort(140, 3000)

@@ -25,7 +25,7 @@ from handavatar.hand.pose_sampling import (
     sample_poses,
 )
 
-NUM_POINTS = 1024
+NUM_POINTS = 2048
 """Vertices, drawn anew in every pose, whose light is looked up."""
 OUTLINE = 0.15
 """Occupancy where a ray that grazes the skin turns opaque: it passes several samples like that."""
@@ -90,7 +90,7 @@ def sampled_poses(
         keys = torch.stack([gesture(rig, names[first]), gesture(rig, names[second])])
         fingers[number] = interpolate_rotations(keys, torch.rand(1, generator=generator))[0]
     fingers = resolve_penetration(rig, fingers)
-    turns = 1 if _is_traced(avatar) else _TURNS
+    turns = 1 if is_traced(avatar) else _TURNS
     total = count * turns
     near = _TURN * torch.randn(total, 3, generator=generator)
     angle = math.pi * torch.rand(total, 1, generator=generator)
@@ -155,7 +155,7 @@ def _in_pose(
     fingers = list(FINGER_BONES.values())
     chosen = torch.randperm(len(fingers), generator=generator)[: 1 + (number % 3 == 0)]
     lifted = torch.zeros(NUM_BONES, dtype=torch.bool)
-    if not _is_traced(avatar) or number % _TRACED_LIFTS == 0:
+    if not is_traced(avatar) or number % _TRACED_LIFTS == 0:
         for finger in chosen.tolist():
             lifted[list(fingers[finger])] = True
     bones = tuple(lifted.nonzero()[:, 0].tolist())
@@ -166,7 +166,7 @@ def _in_pose(
         lights = []
         for lift in dict.fromkeys(((), bones)):
             traced = state.light
-            if _is_traced(avatar) and (lift or which > 0):
+            if is_traced(avatar) and (lift or which > 0):
                 traced = avatar.prepare(HandPose(rotations, torch.zeros(3)), lift).light
             seen = Edit(lifted_bones=lift).of_directed(around)
             light = avatar.illumination(rotations, near, seen, normals, near.interpolated(traced))
@@ -175,7 +175,8 @@ def _in_pose(
     return rows
 
 
-def _is_traced(avatar: HandAvatar) -> bool:
+def is_traced(avatar: HandAvatar) -> bool:
+    """Whether the light of an avatar is traced to the posed mesh."""
     return avatar.illumination.chosen.num_directions > 0
 
 

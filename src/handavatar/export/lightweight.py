@@ -16,7 +16,12 @@ from handavatar.avatar import HandAvatar
 from handavatar.edit import Edit
 from handavatar.export.capsules import Capsules, fit_capsules
 from handavatar.export.correctives import PoseCorrectives, fit_correctives
-from handavatar.export.field_samples import FieldSamples, sample_field, sampled_poses
+from handavatar.export.field_samples import (
+    FieldSamples,
+    is_traced,
+    sample_field,
+    sampled_poses,
+)
 from handavatar.export.packing import Packed, quantised
 from handavatar.export.shading_network import (
     STEPS,
@@ -36,6 +41,8 @@ from handavatar.hand.sparse_skin import SparseSkin
 
 NUM_POSES = 420
 """Poses of the fingers; of them one in seven is held out."""
+NUM_TRACED_POSES = 140
+"""Where light is traced, which takes three times as long and follows the pose more simply."""
 _HELD_OUT = 7
 Tell = Callable[[str, int, int], None]
 """Hears what is being done, how many steps of it are done, and of how many."""
@@ -50,8 +57,13 @@ class Effort:
         steps: of the shading network's fit.
     """
 
-    poses: int = NUM_POSES
+    poses: int
     steps: int = STEPS
+
+    @staticmethod
+    def for_avatar(avatar: HandAvatar) -> "Effort":
+        """As much as the light of an avatar asks for."""
+        return Effort(NUM_TRACED_POSES if is_traced(avatar) else NUM_POSES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,9 +141,9 @@ def lightweight_hand(
         avatar: on the CPU.
         edit: its paint is laid on the avatar's own; all else of edits is for the page.
         tell: hears what is being done.
-        effort: poses and steps.
+        effort: poses and steps; by default what the avatar asks for.
     """
-    effort = effort or Effort()
+    effort = effort or Effort.for_avatar(avatar)
     hand = average_hand(avatar)
     base = avatar.base_rig
     levels = subdivision_levels(base.faces, base.num_vertices, avatar.rounds)

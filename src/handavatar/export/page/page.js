@@ -302,7 +302,7 @@ function begin() {
     }).catch((error) => tell(error.message));
   }
 
-  // For programs: a picture of given size, pose, camera and look, as RGB bytes from the top row.
+  // For programs: a picture of given size, pose, camera and look, as RGBA bytes from the bottom row.
   function shot(wish) {
     Object.assign(scene, { rotations: wish.rotations.map(turnOf), wrist: plus(about.joint, wish.translation) });
     Object.assign(look, { layer: "rgb", gain: 1, shift: [0, 0, 0] }, wish.look, { lifted: new Set(wish.lifted) });
