@@ -48,7 +48,7 @@ Tell = Callable[[str, int, int], None]
 """Hears what is being done, how many steps of it are done, and of how many."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Effort:
     """How much is spent on a lightweight hand.
 
