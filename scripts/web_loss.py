@@ -104,19 +104,24 @@ def shots(avatar: HandAvatar, size: int) -> list[Shot]:
     return found
 
 
-def measure(avatar: HandAvatar, folder: Path, size: int, picture: Path | None) -> dict[str, Any]:
+def measure(
+    avatar: HandAvatar, folder: Path, size: int, picture: Path | None, is_speed_alone: bool
+) -> dict[str, Any]:
     wanted = shots(avatar, size)
     with sync_playwright() as manager:
         browser = manager.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
         page = browser.new_page()
         page.goto((folder / "index.html").resolve().as_uri())
         taken = []
-        for shot in wanted:
+        for shot in [] if is_speed_alone else wanted:
             values = page.evaluate("(wish) => Array.from(handavatar.shot(wish))", shot.wish())
             pixels = np.array(values, dtype=np.uint8).reshape(size, size, 4)[::-1, :, :3]
             taken.append(torch.from_numpy(pixels.copy()).float() / 255)
         speed = page.evaluate(SPEED, wanted[0].wish())
         browser.close()
+    speed = {name: round(value, 2) for name, value in speed.items()}
+    if is_speed_alone:
+        return {"speed": speed, "load": os.getloadavg()[0]}
     rows: dict[str, dict[str, float]] = {}
     strips = []
     for shot, seen in zip(wanted, taken, strict=True):
@@ -136,7 +141,7 @@ def measure(avatar: HandAvatar, folder: Path, size: int, picture: Path | None) -
         label: {name: round(float(np.mean([row[name] for row in part])), 3) for name in part[0]}
         for label, part in (("plain", plain), ("lifted", lifted))
     }
-    return means | {"speed": {name: round(value, 2) for name, value in speed.items()}}
+    return means | {"speed": speed, "load": os.getloadavg()[0]}
 
 
 def _decibels(error: torch.Tensor) -> float:
@@ -149,10 +154,15 @@ if __name__ == "__main__":
     parser.add_argument("folder", type=Path)
     parser.add_argument("--size", type=int, default=256, help="pixels along a side")
     parser.add_argument("--picture", type=Path, help="field above page, side by side (PNG)")
+    parser.add_argument("--speed", action="store_true", help="measure the speed alone")
     arguments = parser.parse_args()
     if not CHROMIUM:
         raise SystemExit("no chromium: apt-get install chromium, or set CHROMIUM")
     found = measure(
-        HandAvatar.load(arguments.avatar), arguments.folder, arguments.size, arguments.picture
+        HandAvatar.load(arguments.avatar),
+        arguments.folder,
+        arguments.size,
+        arguments.picture,
+        arguments.speed,
     )
     print(json.dumps(found, indent=2))

@@ -4,21 +4,36 @@
 
 const LAYERS = ["rgb", "albedo", "illumination", "normal"];
 
-const poseShader = (numCapsules, reach) => `#version 300 es
+// Written out without loops: arrays that a loop's counter indexes are slow in many a shader.
+const each = (count, write) => Array.from({ length: count }, (_, at) => write(at)).join("\n  ");
+
+const capsuleLines = (bones, reach) => each(bones.length, (at) => `{
+    vec4 start = capsules[${2 * at}], end = capsules[${2 * at + 1}];
+    vec3 axis = end.xyz - start.xyz, offset = place - start.xyz;
+    float share = clamp(dot(offset, axis) / dot(axis, axis), 0.0, 1.0);
+    vec3 towards = share * axis - offset;
+    float distance = max(length(towards), 1e-5), radius = mix(start.w, end.w, share), ratio = radius / distance;
+    near${bones[at]} = max(near${bones[at]}, isShown[${bones[at]}] * exp(-max(distance - radius, 0.0) / ${reach}));
+    filled${bones[at]} = max(filled${bones[at]},
+      isShown[${bones[at]}] * min(ratio * ratio, 1.0) * max(dot(towards, facing) / distance, 0.0));
+  }`);
+
+const fourOf = (name, at) => `vec4(${[0, 1, 2, 3].map((next) => name + (4 * at + next)).join(", ")})`;
+const sumOf = (count, term) => Array.from({ length: count }, (_, at) => term(at)).join(" + ");
+
+const poseShader = (bones, reach) => `#version 300 es
 precision highp float;
-const int INPUTS = 11, WIDTH = 8;
 layout(std140) uniform Network {
-  mat4 first[INPUTS * WIDTH];
-  mat4 second[WIDTH * WIDTH];
-  vec4 secondBias[WIDTH];
-  vec4 last[WIDTH];
+  mat4 first[88];
+  mat4 second[64];
+  vec4 secondBias[8];
+  vec4 last[8];
   vec4 lastBias;
 };
 uniform mat4 motions[${BONES}];
-uniform vec4 capsules[${2 * numCapsules}];
-uniform int capsuleBones[${numCapsules}];
+uniform vec4 capsules[${2 * bones.length}];
 uniform float isShown[${BONES}];
-uniform vec4 biases[WIDTH];
+uniform vec4 biases[8];
 in vec3 rest;
 in vec3 normal;
 in uvec4 bones;
@@ -34,40 +49,13 @@ void main() {
     + shares.w * motions[bones.w];
   place = (motion * vec4(rest, 1.0)).xyz;
   facing = normalize(mat3(motion) * normal);
-  float near[${BONES}], filled[${BONES}];
-  for (int bone = 0; bone < ${BONES}; bone++) near[bone] = filled[bone] = 0.0;
-  for (int at = 0; at < ${numCapsules}; at++) {
-    int bone = capsuleBones[at];
-    vec4 start = capsules[2 * at], end = capsules[2 * at + 1];
-    vec3 axis = end.xyz - start.xyz, offset = place - start.xyz;
-    float share = clamp(dot(offset, axis) / dot(axis, axis), 0.0, 1.0);
-    vec3 towards = share * axis - offset;
-    float distance = max(length(towards), 1e-5), radius = mix(start.w, end.w, share);
-    float shown = isShown[bone];
-    near[bone] = max(near[bone], shown * exp(-max(distance - radius, 0.0) / ${reach}));
-    float ratio = radius / distance;
-    filled[bone] = max(filled[bone], shown * min(ratio * ratio, 1.0) * max(dot(towards, facing) / distance, 0.0));
-  }
-  vec4 inputs[INPUTS];
-  inputs[0] = latents0;
-  inputs[1] = latents1;
-  inputs[2] = vec4(facing, 0.0);
-  for (int at = 0; at < 4; at++) {
-    inputs[3 + at] = vec4(near[4 * at], near[4 * at + 1], near[4 * at + 2], near[4 * at + 3]);
-    inputs[7 + at] = vec4(filled[4 * at], filled[4 * at + 1], filled[4 * at + 2], filled[4 * at + 3]);
-  }
-  vec4 hidden[WIDTH];
-  for (int row = 0; row < WIDTH; row++) {
-    hidden[row] = biases[row];
-    for (int at = 0; at < INPUTS; at++) hidden[row] += first[at * WIDTH + row] * inputs[at];
-    hidden[row] = max(hidden[row], 0.0);
-  }
+  ${each(BONES, (bone) => `float near${bone} = 0.0, filled${bone} = 0.0;`)}
+  ${capsuleLines(bones, reach)}
+  vec4 input0 = latents0, input1 = latents1, input2 = vec4(facing, 0.0);
+  ${each(4, (at) => `vec4 input${3 + at} = ${fourOf("near", at)}, input${7 + at} = ${fourOf("filled", at)};`)}
+  ${each(8, (row) => `vec4 hidden${row} = max(biases[${row}] + ${sumOf(11, (at) => `first[${8 * at + row}] * input${at}`)}, 0.0);`)}
   float sum = lastBias.x;
-  for (int row = 0; row < WIDTH; row++) {
-    vec4 value = secondBias[row];
-    for (int at = 0; at < WIDTH; at++) value += second[at * WIDTH + row] * hidden[at];
-    sum += dot(last[row], max(value, 0.0));
-  }
+  ${each(8, (row) => `sum += dot(last[${row}], max(secondBias[${row}] + ${sumOf(8, (at) => `second[${8 * at + row}] * hidden${at}`)}, 0.0));`)}
   light = 1.0 / (1.0 + exp(-sum));
   gl_Position = vec4(0.0);
 }`;
@@ -137,8 +125,8 @@ class Picture {
     const gl = canvas.getContext("webgl2", { antialias: true, alpha: true, premultipliedAlpha: true });
     if (!gl) throw new Error("this browser has no WebGL2");
     this.gl = gl;
-    const numCapsules = hand.capsule_bones.length;
-    this.poser = this.program(poseShader(numCapsules, hand.about.reach), NOTHING, ["place", "facing", "light"]);
+    const shader = poseShader(Array.from(hand.capsule_bones), hand.about.reach);
+    this.poser = this.program(shader, NOTHING, ["place", "facing", "light"]);
     this.viewer = this.program(VIEW, COLOR, null);
     this.posed = this.buffer(gl.ARRAY_BUFFER, new Float32Array(7 * hand.count), gl.DYNAMIC_COPY);
     this.restBuffer = this.buffer(gl.ARRAY_BUFFER, hand.rest, gl.DYNAMIC_DRAW);
@@ -236,7 +224,6 @@ class Picture {
     gl.useProgram(this.poser);
     gl.uniformMatrix4fv(at("motions"), false, posed.motions);
     gl.uniform4fv(at("capsules"), posed.capsules);
-    gl.uniform1iv(at("capsuleBones"), Int32Array.from(this.hand.capsule_bones));
     gl.uniform1fv(at("isShown"), Float32Array.from({ length: BONES }, (_, bone) => (lifted.has(bone) ? 0 : 1)));
     gl.uniform4fv(at("biases"), posed.biases);
     gl.bindBuffer(gl.ARRAY_BUFFER, this.restBuffer);
