@@ -23,10 +23,10 @@ from torch import Tensor
 
 from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chosen_device
 from handavatar.capture.motion import gesture, open_motion
-from handavatar.capture.view import start_of
+from handavatar.capture.view import camera_holding, start_of
 from handavatar.edit import Edit
 from handavatar.field.kernels import Kernel, chosen_kernel
-from handavatar.geometry.cameras import Camera, look_at, project
+from handavatar.geometry.cameras import Camera
 from handavatar.geometry.colors import eight_bits
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
@@ -277,23 +277,11 @@ def camera_on(avatar: HandAvatar, poses: list[HandPose], size: int, room: float 
         room: around the hand, as a share of its longer side, half of it on either side. A camera
             that is to be carried around the hand needs more, for from there it may reach farther.
     """
-    view = avatar.info.get("view")
-    if view is None:
-        middle = _middle(avatar, poses[0])
-        placed = look_at(
-            middle + torch.tensor([0.0, -0.6, 0.0]), middle, torch.tensor([-1.0, 0, 0])
-        )
-    else:
-        placed = torch.tensor(view["camera_from_world"])
-    wide = Camera((1.0, 1.0), (0.0, 0.0), 1, 1, placed)
     with torch.no_grad():
         rest = avatar.rig.to("cpu").shaped(avatar.coefficients.cpu())
-        seen = torch.cat([project(wide, rest.posed(pose).vertices)[0] for pose in poses])
-    lower, upper = seen.amin(0), seen.amax(0)
-    side = float((upper - lower).max()) * (1 + room)
-    left, top = ((lower + upper) / 2 - side / 2).tolist()
-    focal = size / side
-    return Camera((focal, focal), (-left * focal, -top * focal), size, size, placed)
+        points = torch.cat([rest.posed(pose).vertices for pose in poses])
+    middle = _middle(avatar, poses[0])
+    return camera_holding(avatar.info.get("view"), points, middle, size, room)
 
 
 def orbited(camera: Camera, center: Tensor, angle: float) -> Camera:

@@ -28,6 +28,11 @@ def write_whole(files: Mapping[Path, bytes]) -> None:
             aside.unlink(missing_ok=True)
 
 
+def is_taken(folder: Path) -> bool:
+    """Whether something lies where a folder is to be written."""
+    return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+
+
 class UnfinishedFolder:
     """``NAME.unfinished`` beside the folder that it will become.
 
@@ -52,8 +57,7 @@ class UnfinishedFolder:
             ValueError: if the target holds something and may not be overwritten.
         """
         target, record = self.target, self.path / _RECORD
-        is_taken = target.exists() and (not target.is_dir() or any(target.iterdir()))
-        if is_taken and not overwrite:
+        if is_taken(target) and not overwrite:
             raise ValueError(f"--out {target}: not empty; name another, or add --overwrite")
         if record.is_file() and record.read_text(encoding="utf-8") == self._record:
             return

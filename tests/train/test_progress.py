@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from handavatar.train.progress import Progress, duration
+from handavatar.train.progress import Progress, StagedProgress, duration
 
 
 class _Clock:
@@ -76,3 +76,15 @@ def test_durations_read_well() -> None:
     seconds = [0.4, 59.0, 60.0, 185.0, 3600.0, 7800.0, float("inf")]
     expected = ["0 s", "59 s", "1:00 min", "3:05 min", "1:00 h", "2:10 h", "?"]
     assert [duration(value) for value in seconds] == expected
+
+
+def test_stages_follow_one_another(capsys: pytest.CaptureFixture[str]) -> None:
+    with StagedProgress() as progress:
+        for job, total in (("fields", 3), ("network", 2)):
+            for step in range(total):
+                progress(job, step + 1, total)
+    lines = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+    assert [(line["job"], line["step"], line["total"]) for line in lines] == [
+        ("fields", 3, 3),
+        ("network", 2, 2),
+    ]

@@ -77,11 +77,19 @@ def render(words: list[str]) -> int:
 
 
 def export(words: list[str]) -> int:
-    """Avatar -> a rigged GLB with textures, or a posed surface as PLY or OBJ."""
+    """Avatar -> a rigged GLB, a page for any browser, or a posed surface as PLY or OBJ."""
+    import sys
+
     from handavatar.cli.arguments import parse
     from handavatar.export.run import ExportOptions, export_avatar
+    from handavatar.train.progress import StagedProgress
 
-    print(export_avatar(parse(ExportOptions, words, "export", positional=("run", "format"))))
+    options = parse(ExportOptions, words, "export", positional=("run", "format"))
+    with StagedProgress() as progress:
+        out = export_avatar(options, progress)
+    if options.format == "web":
+        print((out / "loss.json").read_text(), end="", file=sys.stderr)
+    print(out)
     return 0
 
 

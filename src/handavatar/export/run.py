@@ -9,19 +9,21 @@ from torch import Tensor
 
 from handavatar import __version__
 from handavatar.avatar import CheckpointError, HandAvatar
-from handavatar.capture.motion import gesture, open_motion
+from handavatar.capture.motion import Motion, gesture, open_motion
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
 from handavatar.export.baking import baked_textures, colors_at_vertices
 from handavatar.export.gltf import glb_bytes
+from handavatar.export.lightweight import Tell, lightweight_hand
 from handavatar.export.polygons import obj_bytes, ply_bytes
 from handavatar.export.rigged import MIRROR, skinned_mesh
 from handavatar.export.skeletons import BoneNames
 from handavatar.export.surface import average_hand, textured_hand
+from handavatar.export.web import web_files
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.hand.pose import HandPose
 from handavatar.retouch import Look
-from handavatar.unfinished import write_whole
+from handavatar.unfinished import UnfinishedFolder, is_taken, write_whole
 
 MAX_TEXTURE = 8192
 
@@ -33,20 +35,21 @@ class ExportOptions(Look):
     Attributes:
         run: run folder, or an avatar file.
         format: ``glb`` has bones, skin weights and textures; ``ply`` (a colour per vertex) and
-            ``obj`` (with .mtl and .png beside it) are the surface in one pose.
-        out: file to write.
+            ``obj`` (with .mtl and .png beside it) are the surface in one pose; ``web`` is a page
+            with light that follows the pose, for any browser.
+        out: file to write; for ``web`` a folder, which must be new or empty.
         bones: names of the joints in a GLB, and how they are arranged: ``webxr`` is the flat
             skeleton of 25 joints that three.js's XRHandMeshModel drives, the others are trees.
         texture_size: texels along a side of the albedo; the occlusion texture has half.
         motion: a motion file (JSON) or a built-in motion (gestures, count, grasp, pinch, ripple,
-            turn) that a GLB carries as an animation.
+            turn) that a GLB carries as an animation, and a page plays.
         pose: a gesture (flat, relaxed, fist, point, ...) that PLY and OBJ show.
         unlit: colours with the mean light baked in, and no engine's light on them.
         overwrite: replace what lies at ``out``.
     """
 
     run: Path
-    format: Literal["glb", "ply", "obj"]
+    format: Literal["glb", "ply", "obj", "web"]
     out: Path
     bones: BoneNames = "webxr"
     texture_size: int = 1024
@@ -56,11 +59,15 @@ class ExportOptions(Look):
     overwrite: bool = False
 
 
-def export_avatar(options: ExportOptions) -> Path:
+def export_avatar(options: ExportOptions, tell: Tell = lambda job, step, total: None) -> Path:
     """Writes the files, aside first.
 
+    Args:
+        options: what to write.
+        tell: hears how far work is that takes minutes.
+
     Returns:
-        The file that was asked for.
+        The file or folder that was asked for.
 
     Raises:
         CheckpointError: if the avatar cannot be read.
@@ -74,6 +81,9 @@ def export_avatar(options: ExportOptions) -> Path:
     if not all(bool(torch.isfinite(value).all()) for value in weights):
         raise CheckpointError(f"{options.run}: holds NaN or infinity; train the avatar again")
     edit = options.edit_on(avatar)
+    if options.format == "web":
+        _write_web(avatar, edit, options, tell)
+        return options.out
     if options.format == "glb":
         contents = [_glb(avatar, edit, options)]
     elif options.format == "ply":
@@ -86,6 +96,12 @@ def export_avatar(options: ExportOptions) -> Path:
 
 def _check(options: ExportOptions) -> None:
     """Refuses what contradicts itself, before anything is read."""
+    if options.format == "web":
+        if options.pose != "flat" or options.unlit:
+            raise ValueError("--pose, --unlit: a page begins in the capture's pose, and is lit")
+        if is_taken(options.out) and not options.overwrite:
+            raise ValueError(f"--out {options.out}: not empty; name another, or add --overwrite")
+        return
     if options.out.suffix.lower() != f".{options.format}":
         raise ValueError(f"--out {options.out}: expected a name that ends in .{options.format}")
     if not 16 <= options.texture_size <= MAX_TEXTURE:
@@ -107,13 +123,30 @@ def _files(options: ExportOptions) -> list[Path]:
 
 
 def _glb(avatar: HandAvatar, edit: Edit, options: ExportOptions) -> bytes:
-    motion = None
-    if options.motion is not None:
-        start = start_of(avatar.info.get("view"))
-        motion = open_motion(options.motion, avatar.base_rig, start)
+    motion = _motion(avatar, options)
     size = options.texture_size
     mesh = skinned_mesh(avatar, edit, options.bones, size, motion, options.unlit)
     return glb_bytes(mesh, f"handavatar {__version__}")
+
+
+def _motion(avatar: HandAvatar, options: ExportOptions) -> Motion | None:
+    if options.motion is None:
+        return None
+    return open_motion(options.motion, avatar.base_rig, start_of(avatar.info.get("view")))
+
+
+def _write_web(avatar: HandAvatar, edit: Edit, options: ExportOptions, tell: Tell) -> None:
+    motion = _motion(avatar, options)
+    light = lightweight_hand(avatar, edit, tell)
+    folder = UnfinishedFolder(options.out, {"format": "web"})
+    folder.begin(options.overwrite)
+    try:
+        for name, content in web_files(avatar, light, edit, motion).items():
+            folder.write(name, content)
+        folder.finish()
+    except BaseException:
+        folder.abandon()
+        raise
 
 
 def _surface(avatar: HandAvatar, options: ExportOptions) -> tuple[Tensor, Tensor, Tensor]:

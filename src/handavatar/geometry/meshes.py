@@ -87,6 +87,17 @@ def subdivide_midpoint(faces: Int[Tensor, "faces 3"], num_vertices: int) -> Subd
     return Subdivision(edges, new_faces.reshape(-1, 3))
 
 
+def subdivision_levels(
+    faces: Int[Tensor, "faces 3"], num_vertices: int, rounds: int
+) -> list[Subdivision]:
+    """So many rounds of midpoint subdivision, coarse first."""
+    levels: list[Subdivision] = []
+    for _ in range(rounds):
+        levels.append(subdivide_midpoint(faces, num_vertices))
+        faces, num_vertices = levels[-1].faces, num_vertices + len(levels[-1].edges)
+    return levels
+
+
 def boundary_loop(faces: Int[Tensor, "faces 3"]) -> Int[Tensor, "rim"]:
     """The one closed boundary of an open mesh, ordered along the half edges of its faces.
 

@@ -160,6 +160,36 @@ class Progress:
         return record
 
 
+class StagedProgress:
+    """Work whose stages follow one another, each with a :class:`Progress`; in a ``with`` block."""
+
+    def __init__(self) -> None:
+        """No stage has begun."""
+        self._job = ""
+        self._progress: Progress | None = None
+
+    def __enter__(self) -> "StagedProgress":
+        """Shows nothing yet."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Leaves the last state of the last stage standing."""
+        if self._progress is not None:
+            self._progress.__exit__(kind, error, traceback)
+
+    def __call__(self, job: str, step: int, total: int) -> None:
+        """Says that ``step`` of ``total`` steps are done; another name begins another stage."""
+        if self._progress is None or job != self._job:
+            self.__exit__(None, None, None)
+            self._job, self._progress = job, Progress(job, total).__enter__()
+        self._progress.update(step)
+
+
 def duration(seconds: float) -> str:
     """``45 s``, ``3:05 min`` or ``2:10 h``; ``?`` if it is not known."""
     if not math.isfinite(seconds):

@@ -17,7 +17,7 @@ from handavatar.edit import Edit
 from handavatar.field.anchors import nearest_anchors
 from handavatar.field.shape import personal_hand
 from handavatar.geometry.cameras import Camera
-from handavatar.geometry.meshes import SurfacePoints, subdivide_midpoint, vertex_normals
+from handavatar.geometry.meshes import SurfacePoints, subdivision_levels, vertex_normals
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand
 from handavatar.render.rasterize import Fragments, interpolate, rasterize
@@ -80,12 +80,8 @@ class BakedAvatar:
             self._from_lit = nearest_anchors(lit, template)
             self._from_probes = nearest_anchors(lit[::every], lit)
             self._albedo = avatar.albedo(self._at_vertices)
-        self._levels = []
-        faces, count = avatar.base_rig.faces, avatar.base_rig.num_vertices
-        for _ in range(avatar.rounds):
-            level = subdivide_midpoint(faces, count)
-            self._levels.append(level)
-            faces, count = level.faces, count + len(level.edges)
+        base = avatar.base_rig
+        self._levels = subdivision_levels(base.faces, base.num_vertices, avatar.rounds)
         self._poses: OrderedDict[bytes, BakedPose] = OrderedDict()
         self._visible: OrderedDict[tuple[int, ...], Tensor] = OrderedDict()
 
