@@ -106,13 +106,9 @@ def is_gone(process: int) -> bool:
     return False
 
 
-def test_losses_and_pictures_change_and_the_page_becomes_the_viewer(
-    page: Any, tiny_capture: Path, tmp_path: Path
-) -> None:
-    steps = ("--steps", "200")
-    alone = Training(tmp_path, tiny_capture, "alone", *steps)
-    assert alone.process.wait(1800) == 0, alone.err
-    training = Training(tmp_path, tiny_capture, "seen", *steps, "--view", "--port", "0")
+def test_losses_and_pictures_change(page: Any, tiny_capture: Path, tmp_path: Path) -> None:
+    # Longer than any picture takes where no core is idle.
+    training = Training(tmp_path, tiny_capture, "run", "--steps", "100000", "--view", "--port", "0")
     try:
         page.goto(training.address(page))
         page.select_option("#size", "128")
@@ -147,6 +143,22 @@ def test_losses_and_pictures_change_and_the_page_becomes_the_viewer(
             " > before",
             arg=points,
         )
+        training.process.send_signal(signal.SIGINT)
+        assert training.process.wait(120) == 130
+        assert "Traceback" not in training.err
+    finally:
+        training.process.kill()
+
+
+def test_the_page_becomes_the_viewer_and_training_is_the_same(
+    page: Any, tiny_capture: Path, tmp_path: Path
+) -> None:
+    steps = ("--steps", "60")
+    alone = Training(tmp_path, tiny_capture, "alone", *steps)
+    assert alone.process.wait(1800) == 0, alone.err
+    training = Training(tmp_path, tiny_capture, "seen", *steps, "--view", "--port", "0")
+    try:
+        page.goto(training.address(page))
         # It goes over by itself, and the ordinary page works.
         page.wait_for_selector("#gesture")
         page.wait_for_selector("canvas[data-stage=fluid], canvas[data-stage=half]")
