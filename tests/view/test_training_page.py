@@ -90,7 +90,7 @@ def browser() -> Iterator[Any]:
 def page(browser: Any) -> Iterator[Any]:
     context = browser.new_context(viewport={"width": 1200, "height": 800})
     made = context.new_page()
-    made.set_default_timeout(400_000)
+    made.set_default_timeout(240_000)
     made.strays = []
     made.on("pageerror", lambda error: made.strays.append(str(error)))
     yield made
@@ -229,7 +229,7 @@ def test_a_killed_trainer_takes_its_page_along_and_view_looks_on_at_another(
         )
         assert watching.stdout is not None
         other = page.context.new_page()
-        other.set_default_timeout(400_000)
+        other.set_default_timeout(240_000)
         other.goto(watching.stdout.readline().split()[1])
         other.wait_for_selector("#picture[data-version]")
         training.process.kill()

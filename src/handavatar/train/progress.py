@@ -143,7 +143,9 @@ class Progress:
             listener(self._record(), is_turning_point)
 
     def _write_line(self) -> None:
-        print(json.dumps(self._record()), file=self._stream, flush=True)
+        # In one piece: others may write lines from another thread.
+        self._stream.write(json.dumps(self._record()) + "\n")
+        self._stream.flush()
 
     def _record(self) -> dict[str, Any]:
         record: dict[str, Any] = {

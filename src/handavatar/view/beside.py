@@ -86,7 +86,9 @@ def page_beside(options: PageOptions) -> Iterator[Beside]:
 def _tell(beside: Beside, process: multiprocessing.process.BaseProcess, lines: Connection) -> None:
     with suppress(EOFError):
         while True:
-            print(lines.recv_bytes().decode(), file=sys.stderr, flush=True)
+            # In one piece: the training's progress goes the same way, from another thread.
+            sys.stderr.write(lines.recv_bytes().decode() + "\n")
+            sys.stderr.flush()
     process.join()
     if not beside.is_closing:
         print(

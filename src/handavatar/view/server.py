@@ -34,8 +34,8 @@ from handavatar.view.turns import Turns
 
 MOST_WAITING = 64
 """Clients whose picture has not been begun; more are asked to try again."""
-_LOW_PRIORITY = 17
-"""Of pictures beside a training: where no core is idle they get a fiftieth of one (Linux)."""
+_LOW_PRIORITY = 14
+"""Of pictures beside a training: where no core is idle they get a twenty-fifth of one (Linux)."""
 _LOOK_EVERY = 1.0
 """Seconds between two looks at a training."""
 _STOPPING = (signal.SIGINT, signal.SIGTERM)

@@ -139,10 +139,11 @@ function setLayer(layer) {
   document.querySelector(`input[name=layer][value=${layer}]`).checked = true;
 }
 
-// A newer avatar: what is being made is finished first, unless that takes long.
+// A newer avatar: what is being made is finished first, unless it is a full picture and takes long. Where no
+// core is idle, half a picture may take longer than a newer avatar, and would never be seen.
 function renewed() {
   order = Math.max(order, 1);
-  if (refining && refining.stage > 0 && performance.now() - refining.begun > PATIENCE) refining.abort();
+  if (refining && refining.stage > 1 && performance.now() - refining.begun > PATIENCE) refining.abort();
   if (waiting) waiting();
 }
 
