@@ -399,7 +399,7 @@ def test_a_page_that_dies_is_said_and_ends_nothing(
         assert json.loads(ask(port, "/training")[1])["phase"] == "waiting"
         lanes = Path(f"/proc/{page._process.pid}/task").iterdir()
         priorities = [os.getpriority(os.PRIO_PROCESS, int(lane.name)) for lane in lanes]
-        assert priorities.count(17) == 2
+        assert priorities.count(14) == 2
         os.kill(page._process.pid or 0, signal.SIGKILL)
         _until(lambda: has_said("the page has ended (exit code -9)"))
         page.stay()  # There is nothing to wait for.

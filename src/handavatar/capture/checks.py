@@ -5,8 +5,9 @@ Every check raises :class:`CaptureError` with what was found and what to do; cal
 
 import json
 import math
+from io import BytesIO
 from pathlib import Path, PurePosixPath
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -150,7 +151,7 @@ def open_picture(path: Path) -> Image.Image:
 
 
 def picture_in(
-    source: Path | IO[bytes], name: str, formats: tuple[str, ...], most_pixels: int
+    source: Path | BytesIO, name: str, formats: tuple[str, ...], most_pixels: int
 ) -> Image.Image:
     """A picture whose header is sound; no pixel is decoded yet.
 

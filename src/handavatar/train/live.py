@@ -97,8 +97,13 @@ def read_live(run: Run) -> LiveState | None:
     """How far a run's training is; None where no trainer has said so."""
     try:
         content = json.loads((live_folder(run) / "progress.json").read_bytes())
-        return LiveState(**content)
-    except (OSError, ValueError, TypeError):
+        # A whole number may stand for any.
+        for name in ("steps_per_second", "seconds_left", "time"):
+            if content.get(name) is not None:
+                content[name] = float(content[name])
+        figures = {name: float(value) for name, value in content["figures"].items()}
+        return LiveState(**{**content, "figures": figures})
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return None
 
 

@@ -323,7 +323,7 @@ class _Curve:
             self._bins = {}
             for number, sums in halved:
                 self._add(number // 2, sums)
-        self._add(step // self._width, [1, step, value])
+        self._add(step // self._width, [1.0, float(step), float(value)])
 
     def points(self) -> list[list[float]]:
         """Pairs of step and value, the means of each bin."""
@@ -333,7 +333,7 @@ class _Curve:
         ]
 
     def _add(self, number: int, sums: list[float]) -> None:
-        before = self._bins.get(number, [0, 0, 0])
+        before = self._bins.get(number, [0.0, 0.0, 0.0])
         self._bins[number] = [a + b for a, b in zip(before, sums, strict=True)]
 
 
