@@ -11,11 +11,14 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from handavatar.avatar import HandAvatar
+from handavatar.train.stopping import stop_signals
 from handavatar.view.server import ViewServer, checked_guard, greeting, keep_serving, serving
 from handavatar.view.studio import Studio
 from handavatar.view.training import Watch
 
 _DEFAULT_OUT = Path("edited")
+_LOOK_EVERY = 0.2
+"""Seconds between two looks whether to end."""
 _PATIENCE = 10.0
 """Seconds for a page to end by itself."""
 
@@ -49,8 +52,10 @@ class Beside:
         """Waits until the page's process ends, or this one is told to stop."""
         if self._process.is_alive():
             print("the page goes over to the avatar; Ctrl-C ends it", file=sys.stderr, flush=True)
-        with suppress(KeyboardInterrupt):
-            self._process.join()
+        # Noted, not raised: where a shell has begun this in the background, Ctrl-C is ignored else.
+        with stop_signals() as stopped:
+            while self._process.is_alive() and not stopped():
+                self._process.join(_LOOK_EVERY)
 
 
 @contextmanager
