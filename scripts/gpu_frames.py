@@ -55,7 +55,7 @@ def decoding(kernel: Kernel) -> tuple[float, float]:
         begin = now()
         decode(*arguments)  # type: ignore[arg-type]
         seconds += now() - begin
-        items = arguments[4]
+        items = arguments[3]
         assert isinstance(items, fused._Items)
         operations += ITEM * len(items.points) + ANSWER * len(items.answers)
 

@@ -1,9 +1,10 @@
 """What several tests need: a small avatar, and a capture of a few small pictures."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -188,3 +189,12 @@ def rig() -> Rig:
 def parts(rig: Rig) -> Parts:
     """Its parts; read only."""
     return divide_into_parts(rig)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Chromium, for tests of pages."""
+    from chromium import launched
+
+    with launched() as running:
+        yield running

@@ -4,8 +4,6 @@ There is no headset here: tracked hands are made up, and WebXR is played by a fe
 """
 
 import io
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from chromium import MARKS, watched
 from conftest import camera_above
 from PIL import Image
 from scipy import ndimage
@@ -36,13 +35,7 @@ from handavatar.hand.pose import FINGER_BONES, HandPose
 from handavatar.hand.pose_sampling import sample_poses
 from handavatar.hand.rig import PosedHand
 
-playwright = pytest.importorskip("playwright.sync_api")
-CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or ""
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not CHROMIUM, reason="needs chromium: apt-get install chromium"),
-]
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+pytestmark = MARKS
 FAKE_XR = (Path(__file__).parent / "fake_webxr.js").read_text(encoding="utf-8")
 
 
@@ -87,12 +80,13 @@ def write(folder: Path, files: dict[str, bytes]) -> None:
         (folder / name).write_bytes(content)
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as manager:
-        running = manager.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        yield running
-        running.close()
+def write_of_side(side: str, avatar: HandAvatar, light: LightweightHand, folder: Path) -> None:
+    before = avatar.info
+    avatar.info = before | {"side": side}
+    try:
+        write(folder, web_files(avatar, light, Edit()))
+    finally:
+        avatar.info = before
 
 
 def opened(browser: Any, folder: Path, script: str = "") -> Any:
@@ -100,20 +94,7 @@ def opened(browser: Any, folder: Path, script: str = "") -> Any:
     page = browser.new_context(viewport={"width": 1000, "height": 760}).new_page()
     page.set_default_timeout(60_000)
     address = (folder / "index.html").as_uri()
-    page.strays = []
-    page.on(
-        "console",
-        lambda message: page.strays.append(message.text) if message.type == "error" else None,
-    )
-    page.on("pageerror", lambda error: page.strays.append(str(error)))
-    page.on(
-        "request",
-        lambda request: (
-            None
-            if request.url == address or request.url.startswith(("data:", "blob:"))
-            else page.strays.append(request.url)
-        ),
-    )
+    watched(page, lambda url: url == address or url.startswith(("data:", "blob:")))
     if script:
         page.add_init_script(script)
     page.goto(address)
@@ -385,12 +366,7 @@ def test_paint_covers_the_skin(
 def test_a_left_hand_is_the_mirror_image(
     browser: Any, avatar: HandAvatar, light: LightweightHand, tmp_path: Path, side: str
 ) -> None:
-    before = avatar.info
-    avatar.info = before | {"side": side}
-    try:
-        write(tmp_path, web_files(avatar, light, Edit()))
-    finally:
-        avatar.info = before
+    write_of_side(side, avatar, light, tmp_path)
     page = opened(browser, tmp_path)
     camera, pose = camera_above(64), HandPose.flat()
     seen = shot(page, pose, camera, "albedo").sum(-1) > 0
@@ -435,12 +411,7 @@ def test_a_tracked_hand_moves_the_avatar(
     browser: Any, avatar: HandAvatar, light: LightweightHand, tmp_path: Path, side: str
 ) -> None:
     """Joints as a headset tells them, of our own hand: the avatar takes its very pose."""
-    before = avatar.info
-    avatar.info = before | {"side": side}
-    try:
-        write(tmp_path, web_files(avatar, light, Edit()))
-    finally:
-        avatar.info = before
+    write_of_side(side, avatar, light, tmp_path)
     page = opened(browser, tmp_path, FAKE_XR)
     page.wait_for_function("() => !document.getElementById('headset').hidden")
     world = torch.tensor(page.evaluate("() => window.handavatar.headset.world")).view(3, 3).float()

@@ -2,8 +2,6 @@
 
 import io
 import json
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,19 +9,14 @@ from typing import Any
 import av
 import numpy as np
 import pytest
+from chromium import MARKS, watched
 from live import live_server
 from PIL import Image
 
 from handavatar.avatar import HandAvatar
 from handavatar.view.server import ViewServer
 
-playwright = pytest.importorskip("playwright.sync_api")
-CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or ""
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not CHROMIUM, reason="needs chromium: apt-get install chromium"),
-]
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+pytestmark = MARKS
 
 
 @pytest.fixture(scope="module")
@@ -34,34 +27,13 @@ def server(
         yield running
 
 
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as manager:
-        running = manager.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        yield running
-        running.close()
-
-
 @pytest.fixture
 def page(browser: Any, server: ViewServer) -> Iterator[Any]:
     """The page with a small picture, and a list ``strays`` of what went wrong on it."""
     context = browser.new_context(viewport={"width": 1100, "height": 800})
     made = context.new_page()
     made.set_default_timeout(60_000)
-    made.strays = []
-    made.on(
-        "console",
-        lambda message: made.strays.append(message.text) if message.type == "error" else None,
-    )
-    made.on("pageerror", lambda error: made.strays.append(str(error)))
-    made.on(
-        "request",
-        lambda request: (
-            None
-            if request.url.startswith((server.address, f"blob:{server.address}"))
-            else made.strays.append(request.url)
-        ),
-    )
+    watched(made, lambda url: url.startswith((server.address, f"blob:{server.address}")))
     made.goto(server.address)
     made.select_option("#size", "64")
     yield made

@@ -1,7 +1,6 @@
 """``train --view`` as a person meets it: a real training, a real browser."""
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -10,17 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from chromium import MARKS
 from source_tree import TOP
 
 from handavatar.train.runs import open_run, read_log
 
-playwright = pytest.importorskip("playwright.sync_api")
-CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or ""
-pytestmark = [
-    pytest.mark.slow,
-    pytest.mark.skipif(not CHROMIUM, reason="needs chromium: apt-get install chromium"),
-]
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+pytestmark = MARKS
 # The pages' process begins with this program as well, but is not the one to run it.
 PROGRAM = """
 import sys
@@ -76,14 +70,6 @@ class Training:
             for child in children.split()
             if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()
         ]
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    with playwright.sync_playwright() as manager:
-        running = manager.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        yield running
-        running.close()
 
 
 @pytest.fixture

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from handavatar.export.field_samples import FieldSamples
-from handavatar.geometry.meshes import Subdivision, vertex_normals
-from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.geometry.meshes import Subdivision, carried_to_fine, vertex_normals
 from handavatar.hand.pose import NUM_BONES
+from handavatar.hand.pose_features import pose_features
 from handavatar.hand.rig import Rig, ShapedHand
 
 NUM_SHAPES = 12
@@ -58,17 +58,7 @@ class PoseCorrectives:
         amounts = self.coefficients(rotations)
         vertices = self.vertices + torch.einsum("k,kvc->vc", amounts, self.shapes)
         joints = self.joints + torch.einsum("k,kbc->bc", amounts, self.joint_shapes)
-        for level in levels:
-            vertices = level.carried(vertices)
-        return ShapedHand(rig, vertices, joints)
-
-
-def pose_features(
-    rotations: Float[Tensor, "*batch bones 3"],
-) -> Float[Tensor, "*batch 135"]:
-    """Entries of the finger bones' rotation matrices minus identity: zero in the zero pose."""
-    matrices = matrix_from_axis_angle(rotations[..., 1:, :])
-    return (matrices - torch.eye(3)).flatten(-3)
+        return ShapedHand(rig, carried_to_fine(vertices, levels), joints)
 
 
 def fit_correctives(samples: FieldSamples, hand: ShapedHand) -> PoseCorrectives:

@@ -28,14 +28,18 @@ from handavatar.export.shading_network import (
     ShadingNetwork,
     Surroundings,
     fit_shading,
-    on_fine_mesh,
     shading_error,
     surroundings,
 )
 from handavatar.export.surface import average_hand
 from handavatar.field.anchors import Neighbours, nearest_anchors
 from handavatar.geometry.colors import eight_bits
-from handavatar.geometry.meshes import Subdivision, subdivision_levels, vertex_normals
+from handavatar.geometry.meshes import (
+    Subdivision,
+    carried_to_fine,
+    subdivision_levels,
+    vertex_normals,
+)
 from handavatar.hand.rig import ShapedHand
 from handavatar.hand.sparse_skin import SparseSkin
 
@@ -159,7 +163,7 @@ def lightweight_hand(
     is_held_out = is_held_out.repeat_interleave(rotations.shape[1])
     known, held_out = samples.chosen(~is_held_out), samples.chosen(is_held_out)
     correctives = stored_correctives(fit_correctives(known, hand))
-    rest = on_fine_mesh(correctives.vertices, levels)
+    rest = carried_to_fine(correctives.vertices, levels)
     hand = replace(hand, rest_vertices=rest, rest_joints=correctives.joints)
     near, normals = _shading_normals(avatar, hand)
     capsules = fit_capsules(hand)

@@ -14,11 +14,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from handavatar.export.capsules import Capsules, occlusion_by_bones
-from handavatar.export.correctives import NUM_FEATURES, pose_features
+from handavatar.export.correctives import NUM_FEATURES
 from handavatar.export.field_samples import FieldSamples
-from handavatar.geometry.meshes import Subdivision
+from handavatar.geometry.meshes import Subdivision, carried_to_fine
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import NUM_BONES, HandPose
+from handavatar.hand.pose_features import pose_features
 from handavatar.hand.rig import PosedHand, ShapedHand
 
 NUM_LATENTS = 8
@@ -128,15 +129,6 @@ def surroundings(
     return Surroundings(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
 
-def on_fine_mesh(
-    values: Float[Tensor, "coarse channels"], levels: list[Subdivision]
-) -> Float[Tensor, "vertices channels"]:
-    """Values at vertices before subdivision, carried through all its levels."""
-    for level in levels:
-        values = level.carried(values)
-    return values
-
-
 def fit_shading(
     samples: FieldSamples,
     around: Surroundings,
@@ -177,7 +169,7 @@ def fit_shading(
         if step % 2:
             occlusion = shown(occlusion, samples.lifted[poses[:, 0]])
             light = samples.lifted_light[poses, points]
-        latents = on_fine_mesh(network.latents, levels)[samples.points[poses, points]]
+        latents = carried_to_fine(network.latents, levels)[samples.points[poses, points]]
         biases = network.biases(samples.rotations[poses[:, 0]])
         found = network(biases, latents, around.normals[poses, points], occlusion)
         optimizer.zero_grad()
@@ -204,7 +196,7 @@ def shading_error(
 ) -> tuple[Float[Tensor, "poses points"], Float[Tensor, "poses points"]]:
     """Illumination by the network less that by the field, without and with lifted shadows."""
     biases = network.biases(samples.rotations)
-    latents = on_fine_mesh(network.latents, levels)[samples.points]
+    latents = carried_to_fine(network.latents, levels)[samples.points]
     lifted = shown(around.occlusion, samples.lifted)
     return (
         network(biases, latents, around.normals, around.occlusion) - samples.light,

@@ -22,8 +22,8 @@ from handavatar.export.capsules import REACH
 from handavatar.export.lightweight import LightweightHand
 from handavatar.export.packing import Packed, packed_bytes, quantised
 from handavatar.export.skeletons import skeleton_of
-from handavatar.hand.pose import BONE_NAMES, FINGER_BONES, HandPose
-from handavatar.hand.pose_sampling import GESTURES, JOINT_LIMITS
+from handavatar.hand.pose import FINGER_BONES, HandPose
+from handavatar.hand.pose_sampling import GESTURES, joint_angles
 
 SCRIPTS = ("hand.js", "picture.js", "headset.js", "page.js")
 LARGEST = 2_000_000
@@ -109,20 +109,7 @@ def facts(
         "rounds": avatar.rounds,
         "reach": REACH,
         "fingers": {finger: list(bones) for finger, bones in FINGER_BONES.items()},
-        "joints": [
-            {
-                "bone": bone,
-                "angle": angle,
-                "finger": name[:-1],
-                "label": f"{name} {kind}",
-                "least": getattr(JOINT_LIMITS[name], kind)[0],
-                "greatest": getattr(JOINT_LIMITS[name], kind)[1],
-            }
-            for bone, name in enumerate(BONE_NAMES)
-            if name in JOINT_LIMITS
-            for angle, kind in enumerate(("flexion", "abduction", "twist"))
-            if getattr(JOINT_LIMITS[name], kind) != (0.0, 0.0)
-        ],
+        "joints": [vars(angle) for angle in joint_angles()],
         "gestures": {
             name: [[round(v, 3) for v in row] for row in made.angles().rad2deg().tolist()]
             for name, made in known.items()

@@ -386,6 +386,7 @@ class PackedHand:
         boxes: lower and upper corner of each part's own box, metres.
         cut: point and normal of the wrist's plane, in the wrist's frame.
         margin: how far boxes reach beyond the parts, metres.
+        pairs: the two parts of each pair, 32-bit.
     """
 
     openings: Float[Tensor, "bones 4 192"]
@@ -393,11 +394,15 @@ class PackedHand:
     boxes: Float[Tensor, "bones 6"]
     cut: Float[Tensor, "6"]
     margin: float
+    pairs: Int[Tensor, "pairs 2"]
 
 
 @torch.no_grad()
 def pack_hand(
-    weights: PackedWeights, part_codes: Float[Tensor, "bones 64"], boxes: PartBoxes
+    weights: PackedWeights,
+    part_codes: Float[Tensor, "bones 64"],
+    boxes: PartBoxes,
+    pairs: Int[Tensor, "pairs 2"],
 ) -> PackedHand:
     """What a pose adds to the weights.
 
@@ -405,6 +410,7 @@ def pack_hand(
         weights: of the decoder.
         part_codes: encodings of the parts.
         boxes: of the parts.
+        pairs: the two parts of each pair.
     """
     of_code, of_place = weights.first.split((part_codes.shape[-1], 3), dim=1)
     transforms = boxes.bone_from_world[:, :3].contiguous()
@@ -416,13 +422,13 @@ def pack_hand(
         torch.cat([boxes.lower, boxes.upper], dim=-1),
         torch.cat([boxes.cut_point, boxes.cut_normal]),
         boxes.margin,
+        pairs.int(),
     )
 
 
 def largest_logits(
     weights: PackedWeights,
     hand: PackedHand,
-    pairs: Int[Tensor, "pairs 2"],
     points: Float[Tensor, "points 3"],
     item_points: Int[Tensor, "items"],
     item_pairs: Int[Tensor, "items"],
@@ -433,7 +439,6 @@ def largest_logits(
     Args:
         weights: packed; with ``tf32`` or ``bf16`` for looking, not for what must be exact.
         hand: packed.
-        pairs: the two parts of each pair, 32-bit.
         points: in the world, metres.
         item_points: the point of each item.
         item_pairs: its pair.
@@ -442,11 +447,11 @@ def largest_logits(
     Source: paper Sec. 3.2 and appendix (local-pair decoder).
     """
     item_pairs, order = item_pairs.int().sort()
-    pair_ends = torch.bincount(item_pairs, minlength=len(pairs)).cumsum(0).int()
+    pair_ends = torch.bincount(item_pairs, minlength=len(hand.pairs)).cumsum(0).int()
     answers = is_wanted[order].flatten().nonzero()[:, 0].int()
     best, winners = _nobody(points, len(hand.transforms))
     items = _Items(item_points[order].int(), item_pairs, answers, pair_ends)
-    _decode(weights, hand, pairs, points, items, pair_ends.tolist(), best, winners)
+    _decode(weights, hand, points, items, pair_ends.tolist(), best, winners)
     ordered = (winners >> 32).int()
     bits = ordered ^ ((ordered >> 31) & 0x7FFFFFFF)
     return torch.where(winners > _NOBODY, bits.view(torch.float32), -torch.inf)
@@ -455,7 +460,6 @@ def largest_logits(
 def fused_occupancy(
     weights: PackedWeights,
     hand: PackedHand,
-    pairs: Int[Tensor, "pairs 2"],
     points: Float[Tensor, "points 3"],
     softness: float,
     sharpness: float,
@@ -465,7 +469,6 @@ def fused_occupancy(
     Args:
         weights: packed.
         hand: packed.
-        pairs: the two parts of each pair, 32-bit.
         points: in the world, metres.
         softness: the paper's tau.
         sharpness: what the logit of the whole is multiplied by.
@@ -477,7 +480,7 @@ def fused_occupancy(
     Source: paper Sec. 3.2, Eq. 1, and Sec. 3.3, Eq. 3.
     """
     points = points.detach().contiguous()
-    count, num_bones, num_pairs = len(points), len(hand.transforms), len(pairs)
+    count, num_bones, num_pairs = len(points), len(hand.transforms), len(hand.pairs)
     whole = points.new_empty(count)
     soft = points.new_empty(count, num_bones)
     deciders = torch.empty(count, dtype=torch.int32, device=points.device)
@@ -488,8 +491,8 @@ def fused_occupancy(
     # Items in the upper half, answers in the lower one.
     counts = torch.empty(num_pairs, count, dtype=torch.int64, device=points.device)
     _boxes[(blocks,)](
-        points, hand.transforms, hand.boxes, hand.cut, pairs, held_by, counts, count, hand.margin,
-        NUM_PAIRS=num_pairs, BLOCK=_POINTS,
+        points, hand.transforms, hand.boxes, hand.cut, hand.pairs, held_by, counts, count,
+        hand.margin, NUM_PAIRS=num_pairs, BLOCK=_POINTS,
     )  # fmt: skip
     ends = counts.flatten().cumsum(0)
     pair_ends = ends[count - 1 :: count]
@@ -500,11 +503,12 @@ def fused_occupancy(
         item_points, item_pairs = deciders.new_empty(num_items), deciders.new_empty(num_items)
         answers = deciders.new_empty(num_answers)
         _listed[(blocks, num_pairs)](
-            held_by, ends, counts, pairs, item_points, item_pairs, answers, count, BLOCK=_POINTS,
+            held_by, ends, counts, hand.pairs, item_points, item_pairs, answers, count,
+            BLOCK=_POINTS,
         )  # fmt: skip
         items = _Items(item_points, item_pairs, answers, (pair_ends >> 32).int())
         ends_here = [end >> 32 for end in found]
-        _decode(weights, hand, pairs, points, items, ends_here, best, winners)
+        _decode(weights, hand, points, items, ends_here, best, winners)
     _values[(blocks,)](
         points, hand.transforms, hand.boxes, best, winners, whole, soft, deciders, count,
         hand.margin, softness, sharpness, BLOCK=_POINTS,
@@ -543,7 +547,6 @@ class _Items:
 def _decode(
     weights: PackedWeights,
     hand: PackedHand,
-    pairs: Int[Tensor, "pairs 2"],
     points: Float[Tensor, "points 3"],
     items: _Items,
     pair_ends: list[int],
@@ -565,12 +568,12 @@ def _decode(
             points.detach().contiguous(),
             items.points,
             items.pair_ends,
-            pairs,
+            hand.pairs,
             hand.openings,
             weights.matrices,
             weights.vectors,
             tokens,
-            len(pairs),
+            len(hand.pairs),
             **constants,
         )
     if len(items.answers):
@@ -579,7 +582,7 @@ def _decode(
             items.answers,
             items.points,
             items.pairs,
-            pairs,
+            hand.pairs,
             weights.matrices[weights.num_trunk_matrices :],
             weights.vectors[weights.num_trunk_vectors :],
             best,

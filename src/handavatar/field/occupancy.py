@@ -437,9 +437,7 @@ class PairOccupancy(nn.Module):
         from handavatar.field.fused import largest_logits
 
         weights, hand = self._packed_for(codes, PRECISIONS["triton"])
-        return largest_logits(
-            weights, hand, self.pairs.int(), points, items.points, items.pairs, items.is_wanted
-        )
+        return largest_logits(weights, hand, points, items.points, items.pairs, items.is_wanted)
 
     def _fused_occupancy(
         self, codes: HandCodes, points: Float[Tensor, "points 3"], precision: Precision
@@ -448,9 +446,8 @@ class PairOccupancy(nn.Module):
         from handavatar.field.fused import fused_occupancy
 
         weights, hand = self._packed_for(codes, precision)
-        pairs = self.pairs.int()
         whole, soft, deciders = fused_occupancy(
-            weights, hand, pairs, points, self.softness, self.sharpness
+            weights, hand, points, self.softness, self.sharpness
         )
         decided = (deciders >= 0).nonzero()[:, 0]
         decider = deciders[decided].long()
@@ -471,7 +468,7 @@ class PairOccupancy(nn.Module):
         weights = self._packed[precision][1]
         known = self._hands.get(codes)
         if known is None or known[0] is not weights:
-            hand = pack_hand(weights, codes.part_codes, codes.boxes)
+            hand = pack_hand(weights, codes.part_codes, codes.boxes, self.pairs)
             known = self._hands[codes] = weights, hand
         return known
 

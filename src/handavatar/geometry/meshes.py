@@ -98,6 +98,15 @@ def subdivision_levels(
     return levels
 
 
+def carried_to_fine(
+    values: Float[Tensor, "coarse channels"], levels: list[Subdivision]
+) -> Float[Tensor, "vertices channels"]:
+    """Per-vertex values carried through all levels of subdivision, coarse first."""
+    for level in levels:
+        values = level.carried(values)
+    return values
+
+
 def boundary_loop(faces: Int[Tensor, "faces 3"]) -> Int[Tensor, "rim"]:
     """The one closed boundary of an open mesh, ordered along the half edges of its faces.
 

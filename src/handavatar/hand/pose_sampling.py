@@ -49,6 +49,39 @@ JOINT_LIMITS: dict[str, JointLimits] = {
 }
 """Every joint but the wrist, which is free: its rotation is the hand's place in the world."""
 
+
+@dataclass(frozen=True)
+class JointAngle:
+    """An angle by which a joint turns, as a slider shows it.
+
+    Attributes:
+        bone: number of the joint's bone.
+        angle: 0 flexion, 1 abduction, 2 twist.
+        finger: that the joint belongs to.
+        label: such as ``index1 flexion``.
+        least: degrees.
+        greatest: degrees.
+    """
+
+    bone: int
+    angle: int
+    finger: str
+    label: str
+    least: float
+    greatest: float
+
+
+def joint_angles() -> list[JointAngle]:
+    """All angles that are free within :data:`JOINT_LIMITS`, joint by joint."""
+    return [
+        JointAngle(bone, angle, name[:-1], f"{name} {kind}", *limits)
+        for bone, name in enumerate(BONE_NAMES)
+        if name in JOINT_LIMITS
+        for angle, (kind, limits) in enumerate(vars(JOINT_LIMITS[name]).items())
+        if limits != (0.0, 0.0)
+    ]
+
+
 # A bent finger cannot be spread: the abduction range shrinks by this part at this flexion.
 _SPREAD_LOSS = 0.85
 _SPREAD_LOSS_FLEXION = math.radians(88)

@@ -15,8 +15,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.geometry.meshes import boundary_loop
-from handavatar.geometry.rotations import matrix_from_axis_angle
-from handavatar.hand.pose import NUM_BONES, HandPose, bone_transforms, linear_blend_skinning
+from handavatar.hand.pose import (
+    NUM_BONES,
+    HandPose,
+    bone_transforms,
+    linear_blend_skinning,
+)
+from handavatar.hand.pose_features import pose_features
 
 _NUM_POSE_FEATURES = 9 * (NUM_BONES - 1)
 
@@ -196,8 +201,7 @@ class Rig:
         directions = self.pose_directions if chosen is None else self.pose_directions[chosen]
         if directions.numel() == 0:
             return directions.new_zeros(*rotations.shape[:-2], len(directions), 3)
-        matrices = matrix_from_axis_angle(rotations[..., 1:, :])
-        features = (matrices - torch.eye(3).to(matrices)).flatten(-3)
+        features = pose_features(rotations)
         return (features @ directions.flatten(0, 1).T).unflatten(-1, (-1, 3))
 
 

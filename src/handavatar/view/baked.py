@@ -17,7 +17,12 @@ from handavatar.edit import Edit
 from handavatar.field.anchors import nearest_anchors
 from handavatar.field.shape import personal_hand
 from handavatar.geometry.cameras import Camera
-from handavatar.geometry.meshes import SurfacePoints, subdivision_levels, vertex_normals
+from handavatar.geometry.meshes import (
+    SurfacePoints,
+    carried_to_fine,
+    subdivision_levels,
+    vertex_normals,
+)
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand
 from handavatar.render.rasterize import Fragments, interpolate, rasterize
@@ -155,9 +160,7 @@ class BakedAvatar:
     def _bake(self, pose: HandPose) -> BakedPose:
         avatar = self._avatar
         coarse = avatar.coarse_rig.shaped(avatar.coefficients)
-        offsets = avatar.shape(coarse, pose.rotations)
-        for level in self._levels:
-            offsets = level.carried(offsets)
+        offsets = carried_to_fine(avatar.shape(coarse, pose.rotations), self._levels)
         posed = personal_hand(avatar.rig.shaped(avatar.coefficients), offsets).posed(pose)
         normals = vertex_normals(posed.vertices, avatar.rig.faces)
         lit_normals = torch.nn.functional.normalize(self._lit.positions(normals), dim=-1)

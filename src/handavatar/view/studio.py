@@ -38,8 +38,8 @@ from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import BONE_NAMES, FINGER_BONES, HandPose
 from handavatar.hand.pose_sampling import (
     GESTURES,
-    JOINT_LIMITS,
     angles_from_rotations,
+    joint_angles,
     rotations_from_angles,
 )
 from handavatar.render.shaded import shaded_mesh
@@ -132,20 +132,6 @@ class Studio:
     def about(self) -> dict[str, Any]:
         """What a page needs to know, as JSON; angles in degrees."""
         known = {**GESTURES, **MORE_GESTURES}
-        joints = [
-            {
-                "bone": bone,
-                "angle": angle,
-                "finger": name[:-1],
-                "label": f"{name} {kind}",
-                "least": getattr(JOINT_LIMITS[name], kind)[0],
-                "greatest": getattr(JOINT_LIMITS[name], kind)[1],
-            }
-            for bone, name in enumerate(BONE_NAMES)
-            if name in JOINT_LIMITS
-            for angle, kind in enumerate(("flexion", "abduction", "twist"))
-            if getattr(JOINT_LIMITS[name], kind) != (0.0, 0.0)
-        ]
         lifted = set(self.start.lifted_bones)
         return {
             "side": self.side,
@@ -154,7 +140,7 @@ class Studio:
             "sizes": list(SIZES),
             "stages": list(STAGES),
             "most_picture_bytes": MOST_PICTURE_BYTES,
-            "joints": joints,
+            "joints": [vars(angle) for angle in joint_angles()],
             "fingers": list(FINGER_BONES),
             "angles": self.angles(None),
             "gestures": {name: self._degrees(gesture(self._rig, name)) for name in known},
@@ -253,13 +239,8 @@ class Studio:
             Interrupted: as soon as it is stale.
             SceneError: as :meth:`shot`.
         """
-        is_full = stage == STAGES[-1]
-        shot = self.shot(scene if is_full else replace(scene, size=scene.size // 2))
-        if scene.layer == "mesh":
-            return mesh_picture(posed_vertices(self._avatar, shot), self._avatar, shot, 2)
-        settings = self._settings if is_full else at_half(self._settings)
-        rendering = rendered(self._avatar, shot, settings, is_stale)
-        return pass_pictures(rendering, self.side)[scene.layer]
+        shot = self.shot(replace(scene, size=size_at(stage, scene.size)))
+        return refined_picture(self._avatar, shot, scene.layer, stage, self._settings, is_stale)
 
     def nearest_anchor(self, scene: Scene, x: float, y: float) -> int | None:
         """The anchor under a point of the picture; None beside the hand.
@@ -424,9 +405,38 @@ def orbiting(
     return camera
 
 
-def at_half(settings: RenderSettings) -> RenderSettings:
-    """The settings of the stage ``half``."""
-    return replace(settings, num_samples=settings.num_samples // 2 or 1, edge_rays=1)
+def size_at(stage: str, size: int) -> int:
+    """Pixels along a side at a stage of the field's pictures."""
+    return size if stage == STAGES[-1] else size // 2
+
+
+def refined_picture(
+    avatar: HandAvatar,
+    shot: Shot,
+    layer: str,
+    stage: str,
+    settings: RenderSettings,
+    is_stale: Callable[[], bool],
+) -> Pixels:
+    """A layer by the field, or the mesh without jags; mirrored back if it is a left hand.
+
+    Args:
+        avatar: whose.
+        shot: of :func:`size_at`.
+        layer: one of ``LAYERS``.
+        stage: ``half`` or ``full``.
+        settings: of the stage ``full``.
+        is_stale: asked every few milliseconds whether to go on.
+
+    Raises:
+        Interrupted: as soon as it is stale.
+    """
+    if layer == "mesh":
+        return mesh_picture(posed_vertices(avatar, shot), avatar, shot, 2)
+    if stage != STAGES[-1]:
+        settings = replace(settings, num_samples=settings.num_samples // 2 or 1, edge_rays=1)
+    rendering = rendered(avatar, shot, settings, is_stale)
+    return pass_pictures(rendering, str(avatar.info.get("side", "right")))[layer]
 
 
 def rendered(

@@ -26,13 +26,12 @@ from handavatar.train.runs import Run
 from handavatar.view.baked import BakedAvatar
 from handavatar.view.scene import SceneError, View
 from handavatar.view.studio import (
-    STAGES,
     Pixels,
     Shot,
-    at_half,
     mesh_picture,
     posed_vertices,
-    rendered,
+    refined_picture,
+    size_at,
 )
 
 MOST_POINTS = 300
@@ -205,14 +204,9 @@ class Watch:
             SceneError: if there is no such frame, or no avatar yet.
         """
         seen = self._seen or self._newest()
-        is_full = stage == STAGES[-1]
-        shot = self._shot(seen, view if is_full else replace(view, size=view.size // 2))
-        if view.layer == "mesh":
-            vertices = posed_vertices(seen.avatar, shot)
-            return Shown(mesh_picture(vertices, seen.avatar, shot, 2), seen.label)
-        settings = self._settings if is_full else at_half(self._settings)
-        rendering = rendered(seen.avatar, shot, settings, is_stale)
-        return Shown(pass_pictures(rendering, self._side)[view.layer], seen.label)
+        shot = self._shot(seen, replace(view, size=size_at(stage, view.size)))
+        pixels = refined_picture(seen.avatar, shot, view.layer, stage, self._settings, is_stale)
+        return Shown(pixels, seen.label)
 
     @property
     def _side(self) -> str:

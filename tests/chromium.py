@@ -1,0 +1,47 @@
+"""Chromium for the tests of pages; a module that imports this is skipped where there is none."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+playwright = pytest.importorskip("playwright.sync_api")
+CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or ""
+MARKS = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not CHROMIUM, reason="needs chromium: apt-get install chromium"),
+]
+"""Of every test of a page."""
+_ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+
+@contextmanager
+def launched() -> Iterator[Any]:
+    """The browser, as long as the block lasts; the fixture ``browser`` is one for a module."""
+    with playwright.sync_playwright() as manager:
+        running = manager.chromium.launch(executable_path=CHROMIUM, args=_ARGUMENTS)
+        yield running
+        running.close()
+
+
+def watched(page: Any, is_expected: Callable[[str], bool]) -> Any:
+    """The page, with a list ``strays`` of what goes wrong or is asked for unexpectedly.
+
+    Args:
+        page: that has not gone anywhere yet.
+        is_expected: of an address, whether the page may ask for it.
+    """
+    page.strays = []
+    page.on(
+        "console",
+        lambda message: page.strays.append(message.text) if message.type == "error" else None,
+    )
+    page.on("pageerror", lambda error: page.strays.append(str(error)))
+    page.on(
+        "request",
+        lambda request: None if is_expected(request.url) else page.strays.append(request.url),
+    )
+    return page
