@@ -44,6 +44,7 @@ def test_the_ways_are_timed_on_the_same_pictures(options: SpeedTableOptions) -> 
     assert json.loads(json.dumps(table.record(), allow_nan=False)) is not None
     shown = table.markdown()
     assert "2 poses of 16x16 pixels" in shown and "ms a hand" in shown
+    assert "8192 places in the box around a hand" in shown
     memory = table.rows["exact, 8 pixels"]["MB at most"]
     assert isinstance(memory, int) and 100 < memory < 2000
 

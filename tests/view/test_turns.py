@@ -129,3 +129,46 @@ def test_what_is_remembered_of_clients_is_bounded(turns: Turns) -> None:
     for n in range(3000):
         turns.submit("fluid", f"{n}", 1, lambda job: None).result()
     assert len(turns._newest) <= 1024
+
+
+def test_a_lane_that_must_keep_to_a_share_rests_in_its_work_and_between() -> None:
+    turns = Turns({"field": nothing}, shares={"field": 0.2})
+    spent: list[float] = []
+
+    def compute(job: Job) -> None:
+        for _ in range(10):
+            end = time.thread_time() + 0.01
+            while time.thread_time() < end:
+                pass
+            assert not job.is_to_end()
+        spent.append(time.thread_time())
+
+    try:
+        begin = time.monotonic()
+        for order in range(1, 9):
+            turns.submit("field", "a", order, compute).result()
+        assert spent[-1] > 0.7
+        # Half a second may be saved up; here nothing was.
+        assert time.monotonic() - begin > spent[-1] / 0.2 - 0.6
+    finally:
+        turns.close()
+
+
+def test_rest_ends_with_the_wish_and_with_the_lanes() -> None:
+    turns = Turns({"field": nothing}, shares={"field": 0.001})
+
+    def greedy(job: Job) -> None:
+        end = time.thread_time() + 0.2
+        while time.thread_time() < end:
+            pass
+        while not job.is_to_end():
+            pass
+
+    running = turns.submit("field", "a", 1, greedy)
+    time.sleep(0.5)
+    turns.submit("field", "a", 2, lambda job: None)
+    with pytest.raises(Overtaken):
+        running.result()
+    begin = time.monotonic()
+    turns.close()
+    assert time.monotonic() - begin < 2

@@ -32,6 +32,7 @@ from handavatar.avatar import (
     RenderSettings,
     chosen_device,
 )
+from handavatar.evaluate.published_coap import published_coap_query
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.geometry.cameras import (
     Camera,
@@ -165,6 +166,7 @@ def speed_table(
                 rows[f"{name}, {count} hands"] = _short_row(rows["plain"], spent / count)
                 finished()
         skinning = _skinning_note(avatar)
+        query = _query_note(avatar, scenes[0].state, options.plain_points)
     empty = 0.0
     for name in ways:
         for size in options.sizes:
@@ -186,6 +188,7 @@ def speed_table(
         "By size of the picture: the first pose in a process of its own; MB: the most that the "
         f"process held, of which {empty:.0f} before the picture was begun.",
         skinning,
+        query,
     )
     return ResultTable("Speed of rendering", rows, notes)
 
@@ -502,6 +505,39 @@ def _skinning_note(avatar: HandAvatar, hands: int = 16) -> str:
         avatar.device,
     )
     return f"{told}, smplx {1e3 * theirs / hands:.2f} ms, in batches of {hands}."
+
+
+def _query_note(
+    avatar: HandAvatar, state: HandState, counts: tuple[int, ...], num_points: int = 8192
+) -> str:
+    """How long occupancy takes at places around a hand: our field, and COAP's published code."""
+    lower, upper = torch.stack(state.posed.vertices.aminmax(dim=0))
+    places = torch.rand(num_points, 3, generator=torch.Generator().manual_seed(0))
+    points = lower + places.to(avatar.device) * (upper - lower)
+
+    def microseconds(query: Callable[[Tensor], object], count: int) -> float:
+        """For a place, with so many at a time."""
+        pieces = points.split(count)
+        spent = _best_seconds(lambda: [query(piece) for piece in pieces], avatar.device, tries=3)
+        return 1e6 * spent / num_points
+
+    ours = microseconds(lambda all_of_them: avatar.occupancy(state.codes, all_of_them), num_points)
+    plain = min(
+        microseconds(lambda piece: avatar.occupancy.plain(state.codes, piece), count)
+        for count in counts
+    )
+    told = (
+        f"Occupancy at {num_points} places in the box around a hand: {ours:.2f} microseconds a "
+        f"place, the plain reference {plain:.2f}"
+    )
+    query = published_coap_query(state.codes.boxes)
+    if isinstance(query, str):
+        return f"{told}; {query}."
+    theirs = min(microseconds(query, count) for count in counts)
+    return (
+        f"{told}, COAP's published query {theirs:.2f} with the same boxes, the best of pieces of "
+        f"{list(counts)} places."
+    )
 
 
 def _best_seconds(work: Callable[[], Any], device: torch.device, tries: int = 5) -> float:

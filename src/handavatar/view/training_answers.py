@@ -64,7 +64,7 @@ class TrainingAnswers:
             if stage == STAGES[0]:
                 shown = self._watch.fluid(view)
             else:
-                shown = self._watch.refined(view, stage, job.is_stale)
+                shown = self._watch.refined(view, stage, job.is_to_end)
             return _jpeg(shown.pixels, ("Avatar", shown.label))
 
         lane = "fluid" if path == "/frame" or stage == STAGES[0] else "field"

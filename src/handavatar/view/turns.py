@@ -5,6 +5,8 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from handavatar.view.share import Share
+
 _REMEMBERED = 1024
 """Clients whose newest order is known."""
 
@@ -35,10 +37,17 @@ class Job:
         self._stale = threading.Event()
         self._result: Any = None
         self._error: BaseException | None = None
+        self._share: Share | None = None
 
     def is_stale(self) -> bool:
         """Whether nobody wants it any more."""
         return self._stale.is_set()
+
+    def is_to_end(self) -> bool:
+        """Whether it is stale; asked by the work itself, which rests here if its lane must."""
+        if self._share is not None:
+            self._share.rest(self.is_stale)
+        return self.is_stale()
 
     def drop(self) -> None:
         """Nobody wants it any more."""
@@ -60,8 +69,13 @@ class Job:
             raise self._error
         return self._result
 
-    def run(self) -> None:
-        """Does the work, unless it is stale; never raises."""
+    def run(self, share: Share | None = None) -> None:
+        """Does the work, unless it is stale; never raises.
+
+        Args:
+            share: of a core, if the thread must keep to one.
+        """
+        self._share = share
         try:
             if not self.is_stale():
                 self._result = self._work(self)
@@ -79,13 +93,20 @@ class Turns:
     ones stale in all lanes.
     """
 
-    def __init__(self, lanes: Mapping[str, Callable[[], None]], most_waiting: int = 64) -> None:
+    def __init__(
+        self,
+        lanes: Mapping[str, Callable[[], None]],
+        most_waiting: int = 64,
+        shares: Mapping[str, float] | None = None,
+    ) -> None:
         """Starts the threads.
 
         Args:
             lanes: names of the lanes, and what the thread of each does first.
             most_waiting: in each lane.
+            shares: of a core, of lanes that must keep to one.
         """
+        self._shares = dict(shares or {})
         self._changed = threading.Condition()
         self._most_waiting = most_waiting
         self._newest: OrderedDict[str, int] = OrderedDict()
@@ -152,6 +173,7 @@ class Turns:
 
     def _work(self, lane: str, begin: Callable[[], None]) -> None:
         begin()
+        share = Share(self._shares[lane]) if lane in self._shares else None
         waiting = self._waiting[lane]
         while True:
             with self._changed:
@@ -160,9 +182,11 @@ class Turns:
                     return
                 job = waiting.popitem(last=False)[1]
                 self._running[lane] = job
-            job.run()
+            job.run(share)
             with self._changed:
                 self._running[lane] = None
+            if share is not None:
+                share.rest(lambda: self._is_closed)
 
 
 def _forget(job: Job) -> None:
