@@ -191,6 +191,28 @@ def test_the_picture_changes_with_the_avatar(trainer: Trainer) -> None:
         assert torch.equal(value, seen.avatar.state_dict()[name]), name
 
 
+def test_a_newer_avatar_that_comes_in_mid_picture_can_be_seen(trainer: Trainer) -> None:
+    trainer.step(1)
+    trainer.step(2)
+    view = View(0, "rgb", 32)
+    trainer.watch.fluid(view)
+    labels: list[str] = []
+
+    def is_stale() -> bool:
+        """In the middle of a picture a newer avatar is taken up, then the picture is dropped."""
+        if not labels:
+            trainer.step(3)
+            labels.append(trainer.watch.fluid(view).label)
+        return True
+
+    with pytest.raises(Interrupted):
+        trainer.watch.refined(view, "half", is_stale)
+    assert labels == ["train 3"]
+    # What ended that picture has not come along.
+    assert trainer.watch.fluid(view).pixels.any()
+    assert trainer.watch.refined(view, "half", never).label == "train 3"
+
+
 def test_what_there_is_not_is_refused(trainer: Trainer) -> None:
     with pytest.raises(SceneError, match="again"):
         trainer.watch.fluid(View(0, "rgb", 64))

@@ -224,7 +224,8 @@ class Watch:
             before, version = self._seen, self._version()
             if version and (before is None or before.version != version):
                 path = live_avatar(self._run)
-                avatar = HandAvatar.load(path) if before is None else before.avatar.reloaded(path)
+                # Of the twin: what ends the other in mid-evaluation would be copied with it.
+                avatar = HandAvatar.load(path) if before is None else before.twin.reloaded(path)
                 self._seen = _Seen(avatar, copy.deepcopy(avatar), version, live_poses(avatar))
             if self._seen is None:
                 raise SceneError("there is no avatar to be seen yet: try again")
