@@ -1,4 +1,4 @@
-"""A thread's share of a core: it is kept in the long run; what was saved can be spent at once."""
+"""A share of a core: it is kept in the long run; what was saved can be spent at once."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from handavatar.view.share import Share
 
 
 class Clocks:
-    """Time that passes while the thread computes or sleeps."""
+    """Time that passes while a process computes or sleeps."""
 
     def __init__(self) -> None:
         self.now = self.own = self.slept = 0.0

@@ -100,7 +100,15 @@ def test_losses_and_pictures_change(page: Any, tiny_capture: Path, tmp_path: Pat
         page.select_option("#size", "128")
         page.wait_for_selector("#job[data-phase=training][data-job=train]")
         page.check("input[name=layer][value=rgb]")
-        page.wait_for_selector("#picture[data-version][data-stage='1']")
+        page.wait_for_selector("#picture[data-version][data-stage='0']")
+        first = page.evaluate("[picture.toDataURL(), picture.dataset.version]")
+        page.wait_for_function(
+            "before => picture.dataset.stage == 0 && picture.dataset.version != before[1] &&"
+            " picture.toDataURL() != before[0]",
+            arg=first,
+        )
+        page.select_option("#detail", "1")
+        page.wait_for_selector("#picture[data-stage='1']")
         first = page.evaluate("[picture.toDataURL(), picture.dataset.version]")
         assert page.locator("#frames canvas").count() == 3
         page.wait_for_selector("[data-curve='train: loss']")

@@ -27,6 +27,7 @@ from handavatar.view.answers import AvatarAnswers
 from handavatar.view.connections import bound
 from handavatar.view.films import Films
 from handavatar.view.guard import Guard, guard_of, is_loopback
+from handavatar.view.share import Share
 from handavatar.view.studio import Studio
 from handavatar.view.training import Watch
 from handavatar.view.training_answers import TrainingAnswers
@@ -36,8 +37,8 @@ MOST_WAITING = 64
 """Clients whose picture has not been begun; more are asked to try again."""
 _LOW_PRIORITY = 14
 """Of pictures beside a training: where no core is idle they get a twenty-fifth of one (Linux)."""
-_SHARES = {"fluid": 0.025, "field": 0.015}
-"""Of all cores together, for pictures beside a training, be the cores idle or not."""
+_SHARE = 0.04
+"""Of all cores together, for a page beside a training, be the cores idle or not."""
 _LOOK_EVERY = 1.0
 """Seconds between two looks at a training."""
 _STOPPING = (signal.SIGINT, signal.SIGTERM)
@@ -101,8 +102,8 @@ class ViewServer:
 
     def _begin(self, shown: Studio | Watch) -> tuple[Turns, Films | None]:
         if isinstance(shown, Watch):
-            shares = {lane: share * self._cores for lane, share in _SHARES.items()}
-            turns = Turns(dict.fromkeys(_SHARES, _step_back), MOST_WAITING, shares)
+            share = Share(_SHARE * self._cores)
+            turns = Turns({"fluid": _step_back, "field": _step_back}, MOST_WAITING, share)
             self._http.answers = TrainingAnswers(shown, turns)
             return turns, None
         # One core for what must be there at once: torch's threads are of no use to it, and it would

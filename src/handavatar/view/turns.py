@@ -44,7 +44,7 @@ class Job:
         return self._stale.is_set()
 
     def is_to_end(self) -> bool:
-        """Whether it is stale; asked by the work itself, which rests here if its lane must."""
+        """Whether it is stale; asked by the work itself, which rests here if it must."""
         if self._share is not None:
             self._share.rest(self.is_stale)
         return self.is_stale()
@@ -73,7 +73,7 @@ class Job:
         """Does the work, unless it is stale; never raises.
 
         Args:
-            share: of a core, if the thread must keep to one.
+            share: of a core, if there is one to be kept to.
         """
         self._share = share
         try:
@@ -97,16 +97,16 @@ class Turns:
         self,
         lanes: Mapping[str, Callable[[], None]],
         most_waiting: int = 64,
-        shares: Mapping[str, float] | None = None,
+        share: Share | None = None,
     ) -> None:
         """Starts the threads.
 
         Args:
             lanes: names of the lanes, and what the thread of each does first.
             most_waiting: in each lane.
-            shares: of a core, of lanes that must keep to one.
+            share: of a core, if all of them together must keep to one.
         """
-        self._shares = dict(shares or {})
+        self._share = share
         self._changed = threading.Condition()
         self._most_waiting = most_waiting
         self._newest: OrderedDict[str, int] = OrderedDict()
@@ -173,7 +173,6 @@ class Turns:
 
     def _work(self, lane: str, begin: Callable[[], None]) -> None:
         begin()
-        share = Share(self._shares[lane]) if lane in self._shares else None
         waiting = self._waiting[lane]
         while True:
             with self._changed:
@@ -182,11 +181,11 @@ class Turns:
                     return
                 job = waiting.popitem(last=False)[1]
                 self._running[lane] = job
-            job.run(share)
+            job.run(self._share)
             with self._changed:
                 self._running[lane] = None
-            if share is not None:
-                share.rest(lambda: self._is_closed)
+            if self._share is not None:
+                self._share.rest(lambda: self._is_closed)
 
 
 def _forget(job: Job) -> None:
