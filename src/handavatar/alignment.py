@@ -19,7 +19,7 @@ from handavatar.hand.pose import (
     skinning_jacobian,
 )
 from handavatar.hand.rig import ShapedHand
-from handavatar.render.rasterize import rasterize
+from handavatar.render.rasterize import covered_pixels
 from handavatar.render.silhouette import OutlinePoints, outline_points, signed_distance
 
 # Of the picture's width: how far apart outline and border are in a good fit, and how far apart
@@ -148,6 +148,6 @@ def _overlap(
     hand: ShapedHand, pose: HandPose, camera: Camera, mask: Bool[Tensor, "height width"]
 ) -> float:
     """Intersection over union of the posed hand and the mask."""
-    covered = rasterize(hand.posed(pose).vertices, hand.rig.faces, camera).mask
+    covered = covered_pixels(hand.posed(pose).vertices, hand.rig.faces, camera)
     mask = mask.to(covered.device)
     return int((covered & mask).sum()) / max(int((covered | mask).sum()), 1)

@@ -39,7 +39,7 @@ from handavatar.hand.parts import finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import RIG_ARRAYS, PosedHand, Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
-from handavatar.render.rasterize import rasterize
+from handavatar.render.rasterize import covered_pixels
 from handavatar.render.sampling import depths_along, intervals_through_boxes
 from handavatar.render.skylight import even_directions, sky_light
 from handavatar.render.volume import composite_sparse, visibility
@@ -637,7 +637,7 @@ class HandAvatar(nn.Module):
         """Pixels within ``margin`` (a share of the picture's width) of the posed mesh."""
         if math.isinf(margin):
             return torch.ones(camera.height, camera.width, dtype=torch.bool, device=self.device)
-        covered = rasterize(state.posed.vertices, self.rig.faces, camera).mask
+        covered = covered_pixels(state.posed.vertices, self.rig.faces, camera)
         radius = math.ceil(margin * camera.width)
         # Two one-dimensional maxima make a square; it holds the disc of the same radius.
         grown = covered[None, None].float()

@@ -11,6 +11,7 @@ from handavatar.geometry.cameras import Camera, project, rays_through_pixels
 from handavatar.render.rasterize import (
     NEAR_PLANE,
     Fragments,
+    covered_pixels,
     interpolate,
     pixels_in_boxes,
     rasterize,
@@ -70,6 +71,16 @@ def test_equals_every_ray_against_every_face(num_faces: int, size: float) -> Non
     assert torch.allclose(fast.barycentric[seen].double(), slow.barycentric[seen], atol=1e-3)
     assert bool((fast.depth[~seen] == math.inf).all())
     assert bool((fast.barycentric[~seen] == 0).all())
+
+
+@pytest.mark.parametrize(("num_faces", "size"), [(0, 1.0), (8, 0.8), (200, 0.1), (25, 1.5)])
+def test_covered_pixels_are_those_of_the_rasterised_mesh(num_faces: int, size: float) -> None:
+    for seed in range(5):
+        vertices, faces = random_mesh(seed, num_faces, size)
+        vertices[: num_faces // 4] = math.nan
+        vertices[num_faces // 4 : num_faces // 2, 2] = -1.0
+        expected = rasterize(vertices, faces, camera()).mask
+        assert torch.equal(covered_pixels(vertices, faces, camera()), expected)
 
 
 def test_interpolated_positions_lie_on_the_pixels_rays() -> None:

@@ -13,6 +13,7 @@ from handavatar.hand.open_hand import load_open_hand
 from handavatar.render.rasterize import rasterize
 from handavatar.render.silhouette import (
     WINDOW,
+    _is_covered,
     outline_points,
     signed_distance,
     silhouette_loss,
@@ -100,6 +101,27 @@ def test_the_outline_is_that_of_the_whole_mesh() -> None:
     # inside, the few pixels behind the meeting of two outlines may be off by half a pixel
     assert float((found - expected)[~outside].abs().max()) < 0.45 / 2
     assert float(((found - expected)[near].abs() > 0.03).float().mean()) < 0.03
+
+
+@pytest.mark.parametrize("margin", [0, 3])
+def test_points_are_covered_where_any_face_holds_them(margin: int) -> None:
+    generator = torch.Generator().manual_seed(margin)
+    corners = 40 * torch.rand(60, 1, 2, generator=generator) - 5
+    corners = corners + 8 * torch.rand(60, 3, 2, generator=generator)
+    corners[7, 1] = math.nan
+    points = 30 * torch.rand(400, 2, generator=generator) - margin
+    points[:200] = points[:200] / 6 + 10  # Many in a few pixels, none in most.
+    a, b, c = (corners[None, :, index] - points[:, None] for index in range(3))
+    crosses = [
+        one[..., 0] * other[..., 1] - one[..., 1] * other[..., 0]
+        for one, other in ((a, b), (b, c), (c, a))
+    ]
+    sides = torch.stack(crosses).sign()
+    expected = (sides.amin(0) >= 0) | (sides.amax(0) <= 0)
+    expected = expected & ~corners.isnan().flatten(1).any(1)
+    found = _is_covered(points, corners, margin, 30, 30)
+    assert 20 < int(found.sum()) < 380
+    assert torch.equal(found, expected.any(1))
 
 
 def test_half_coverage_is_the_hard_mask_and_far_pixels_are_sure() -> None:

@@ -21,7 +21,7 @@ from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, ShapedHand
 from handavatar.peers.descent import descend
-from handavatar.render.rasterize import rasterize
+from handavatar.render.rasterize import covered_pixels
 from handavatar.render.volume import composite_sparse, visibility
 
 REACH = 0.008
@@ -109,7 +109,7 @@ def ray_samples(avatar: HandAvatar, frame: Frame, stride: int = 1) -> RaySamples
     camera, pose = frame.camera, frame.pose
     hand = avatar.personal(pose)
     posed = hand.posed(pose)
-    covered = rasterize(posed.vertices, avatar.rig.faces, camera).mask[None, None].float()
+    covered = covered_pixels(posed.vertices, avatar.rig.faces, camera)[None, None].float()
     size = 2 * _MARGIN + 1
     near = nn.functional.max_pool2d(covered, size, stride=1, padding=_MARGIN)[0, 0] > 0
     grid = torch.zeros_like(near)

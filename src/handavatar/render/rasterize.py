@@ -96,6 +96,27 @@ def rasterize_projected(
     return _fragments(nearest, corners, corner_depths, (height, width), depths.dtype)
 
 
+@torch.no_grad()
+def covered_pixels(
+    vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"], camera: Camera
+) -> Bool[Tensor, "height width"]:
+    """The mask of :func:`rasterize`, without asking which face is the nearest.
+
+    Args:
+        vertices: metres, world.
+        faces: either winding.
+        camera: the view.
+    """
+    pixels, depths = project(camera, vertices)
+    corners = pixels.double()[faces[is_before_camera(depths.double()[faces])]]
+    covered = torch.zeros(camera.height * camera.width, dtype=torch.bool, device=pixels.device)
+    lower, upper = corners.amin(1), corners.amax(1)
+    for face, x, y in pixels_in_boxes(lower, upper, camera.width, camera.height):
+        holds = holds_in_image(corners[face], torch.stack([x, y], dim=-1) + 0.5)
+        covered[(y * camera.width + x)[holds]] = True
+    return covered.view(camera.height, camera.width)
+
+
 def interpolate(
     fragments: Fragments,
     faces: Int[Tensor, "faces 3"],
@@ -166,12 +187,30 @@ def weights_in_image(
 
     Triangles without area hold nothing. Weights of points outside have no meaning.
     """
-    (x0, x1, x2), (y0, y1, y2) = (corners - points[:, None]).permute(2, 1, 0)
-    doubled_areas = torch.stack([x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0], dim=-1)
+    doubled_areas = _doubled_areas(corners, points)
     total = doubled_areas.sum(-1)
-    one_sided = (doubled_areas.amin(-1) >= 0) | (doubled_areas.amax(-1) <= 0)
-    holds = one_sided & (total != 0)
+    holds = _is_one_sided(doubled_areas) & (total != 0)
     return doubled_areas / torch.where(holds, total, 1.0)[:, None], holds
+
+
+def holds_in_image(
+    corners: Float[Tensor, "pairs 3 2"], points: Float[Tensor, "pairs 2"]
+) -> Bool[Tensor, "pairs"]:
+    """Whether the closed triangle holds the point; the second of :func:`weights_in_image`."""
+    doubled_areas = _doubled_areas(corners, points)
+    return _is_one_sided(doubled_areas) & (doubled_areas.sum(-1) != 0)
+
+
+def _doubled_areas(
+    corners: Float[Tensor, "pairs 3 2"], points: Float[Tensor, "pairs 2"]
+) -> Float[Tensor, "pairs 3"]:
+    """Of the triangles that the point makes with each side, with sign."""
+    (x0, x1, x2), (y0, y1, y2) = (corners - points[:, None]).permute(2, 1, 0)
+    return torch.stack([x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0], dim=-1)
+
+
+def _is_one_sided(doubled_areas: Float[Tensor, "pairs 3"]) -> Bool[Tensor, "pairs"]:
+    return (doubled_areas.amin(-1) >= 0) | (doubled_areas.amax(-1) <= 0)
 
 
 def _fragments(

@@ -15,11 +15,11 @@ from torch.nn.functional import interpolate
 
 from handavatar.geometry.cameras import Camera, project
 from handavatar.render.rasterize import (
+    covered_pixels,
+    holds_in_image,
     is_before_camera,
     numbered_copies,
     pixels_in_boxes,
-    rasterize,
-    weights_in_image,
 )
 
 WINDOW = 3.0
@@ -63,7 +63,7 @@ def soft_silhouette(
         mesh counts as one polygon; for a single triangle both are equal.
     """
     width, height = camera.width, camera.height
-    covered = rasterize(vertices, faces, camera).mask.reshape(-1)
+    covered = covered_pixels(vertices, faces, camera).reshape(-1)
     pixels, depths = project(camera, vertices)
     seen = faces[is_before_camera(depths[faces])]
     outline = _outline(pixels.detach(), seen, WINDOW * softness, width, height)
@@ -287,15 +287,35 @@ def _is_covered(
     first_point = num_points.cumsum(0) - num_points
     covered = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     lower, upper = corners.amin(1) - 0.5, corners.amax(1) + 0.5
+    is_near = _holds_any(num_points.view(rows, columns), lower, upper)
+    corners, lower, upper = corners[is_near], lower[is_near], upper[is_near]
     for face, x, y in pixels_in_boxes(lower, upper, columns, rows):
         pixel = y * columns + x
         is_met = num_points[pixel] > 0
         face, pixel = face[is_met], pixel[is_met]
         pair, rank = numbered_copies(num_points[pixel])
         point = by_home[first_point[pixel[pair]] + rank]
-        _, holds = weights_in_image(corners[face[pair]], points[point])
+        holds = holds_in_image(corners[face[pair]], points[point])
         covered[point[holds]] = True
     return covered
+
+
+def _holds_any(
+    counts: Int[Tensor, "height width"],
+    lower: Float[Tensor, "boxes 2"],
+    upper: Float[Tensor, "boxes 2"],
+) -> Bool[Tensor, "boxes"]:
+    """Whether any pixel whose centre lies in the box has a count above zero."""
+    height, width = counts.shape
+    # Entry (y, x): the sum over all pixels above and left of it.
+    sums = torch.nn.functional.pad(counts.cumsum(0).cumsum(1), (1, 0, 1, 0))
+    size = lower.new_tensor([width, height])
+    # Clamped as integers too: what is not a number becomes an empty box.
+    first = (lower - 0.5).ceil().clamp_min(0).minimum(size).long().clamp_min(0)
+    end = ((upper - 0.5).floor() + 1).clamp_min(0).minimum(size).long().clamp_min(0)
+    (left, top), (right, bottom) = first.T, end.maximum(first).T
+    within = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    return within > 0
 
 
 def _nearest_pieces(
