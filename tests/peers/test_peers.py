@@ -126,6 +126,8 @@ def test_the_table_is_kept_and_has_every_row(
     done: list[int] = []
     found = peers_table(options, done.append)
     assert list(found.rows) == [*table.PEERS, *table.OURS]
+    assert sum(" minus " in note for note in found.notes) == len(table.PEERS) * len(table.OURS)
+    assert "ours (best) minus textured mesh: ssim " in found.markdown()
     assert done[-1] == options.total_steps
     stored = json.loads((tmp_path / f"peers-{tiny_capture.name}.json").read_text())
     assert len(stored["rows"]["textured mesh"]["0"]["psnr"]) == 2

@@ -144,11 +144,21 @@ def _table(measured: list[dict[str, Any]], options: PeersTableOptions) -> Result
                 text = mean_interval(ahead).of_difference()
             line[f"{ours} ahead by"] = text
         rows[name] = line
+    others = [key for key in keys if "psnr" not in key]
+
+    def against(peer: str, ours: str) -> str:
+        ahead = {key: mean_interval(of_frames(ours, key) - of_frames(peer, key)) for key in others}
+        parts = (
+            f"{key} {at.mean:+.4f} [{at.low:+.4f}, {at.high:+.4f}]" for key, at in ahead.items()
+        )
+        return f"{ours} minus {peer}: {', '.join(parts)}."
+
     count = len(of_frames(PEERS[0], "psnr"))
     notes = (
         f"Captures: {', '.join(found['capture'] for found in measured)}; {count} test frames of "
         f"poses and cameras never seen, seeds {list(options.seeds)}; {options.steps} steps of ours "
         f"and {options.peer_steps} of the others on the same frames and the same personal mesh. "
         "Ahead: masked PSNR, decibels, paired by frame, mean over seeds [95 % over frames].",
+        *(against(peer, ours) for peer in PEERS for ours in OURS),
     )
     return ResultTable("Prior art", rows, notes)
