@@ -46,7 +46,7 @@ from handavatar.hand.sparse_skin import SparseSkin
 NUM_POSES = 420
 """Poses of the fingers; of them one in seven is held out."""
 NUM_TRACED_POSES = 280
-"""Where light is traced, which takes thrice as long; with half as many, colours lose 0.7 dB more."""
+"""Where light is traced, which takes thrice as long; half as many lose 0.7 dB of colour."""
 _HELD_OUT = 7
 Tell = Callable[[str, int, int], None]
 """Hears what is being done, how many steps of it are done, and of how many."""
