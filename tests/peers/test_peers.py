@@ -121,7 +121,6 @@ def test_the_table_is_kept_and_has_every_row(
 
     monkeypatch.setitem(METHODS, "quick", replace(TINY, cues=TracedCues()))
     monkeypatch.setattr(textured_mesh, "NUM_TEXELS", 500)
-    monkeypatch.setattr(table, "judged", lambda shading, geometry, capture: (_scores(geometry), {}))
     options = PeersTableOptions((tiny_capture,), tmp_path, seeds=(0,), steps=2, peer_steps=2)
     done: list[int] = []
     found = peers_table(options, done.append)
@@ -134,12 +133,3 @@ def test_the_table_is_kept_and_has_every_row(
     assert str(found.rows["inverse skinning"]["ours (best) ahead by"]).count("[") == 1
     monkeypatch.setattr(table, "fitted_geometry", None)
     assert peers_table(options) == found
-
-
-def _scores(geometry: object) -> dict[str, list[float]]:
-    """Of a capture that knows no truth of the split."""
-    scores = FrameScores()
-    for view in geometry.views:  # type: ignore[attr-defined]
-        shape = view.frame.image.shape
-        scores.add(view.frame, torch.zeros(shape), torch.ones(shape[:2]))
-    return scores.by_name

@@ -8,19 +8,23 @@ from typing import Any
 
 import torch
 
+from handavatar.avatar import RenderSettings
 from handavatar.capture.checks import load_json
-from handavatar.capture.frames import read_capture
+from handavatar.capture.frames import Frame, read_capture
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.peers.inverse_skinning import fit_inverse_skinning
-from handavatar.peers.textured_mesh import fit_textured_mesh
+from handavatar.peers.textured_mesh import RAYS, fit_textured_mesh
 from handavatar.train.ablation import (
     ROWS,
     FittedGeometry,
     FrameScores,
+    Shading,
+    View,
     fitted_geometry,
-    judged,
+    shaded_view,
     trained_shading,
+    view_of_frame,
 )
 from handavatar.train.loop import METHODS
 from handavatar.train.runs import write_json
@@ -74,6 +78,7 @@ def peers_table(
         "seeds": list(options.seeds),
         "steps": options.steps,
         "peer_steps": options.peer_steps,
+        "rays": RAYS,
     }
     for folder in options.captures:
         path = options.kept / f"peers-{folder.name}.json"
@@ -95,6 +100,7 @@ def _measured(
 ) -> dict[str, dict[str, Any]]:
     capture, method = read_capture(folder), METHODS["quick"]
     geometry = fitted_geometry(capture, "personal", method, 0)
+    views = [_finer_view(geometry, view.frame, method.num_samples) for view in geometry.views]
     rows: dict[str, dict[str, Any]] = {}
     for seed in options.seeds:
         for name in PEERS:
@@ -102,9 +108,27 @@ def _measured(
             finished()
         for name, part in OURS.items():
             shading = trained_shading(ROWS[part], geometry, method, options.steps, seed)
-            rows.setdefault(name, {})[str(seed)] = judged(shading, geometry, capture)[0]
+            rows.setdefault(name, {})[str(seed)] = _our_scores(shading, views, geometry)
             finished()
     return rows
+
+
+def _finer_view(geometry: FittedGeometry, frame: Frame, num_samples: int) -> View:
+    """With as many rays a pixel as the textured mesh, whose outlines are smooth."""
+    camera = frame.camera.resized(RAYS * frame.camera.width, RAYS * frame.camera.height)
+    return view_of_frame(geometry.avatar, frame, camera, RenderSettings(num_samples=num_samples))
+
+
+def _our_scores(
+    shading: Shading, views: list[View], geometry: FittedGeometry
+) -> dict[str, list[float]]:
+    scores = FrameScores()
+    for fine, view in zip(views, geometry.views, strict=True):
+        picture = shaded_view(shading, fine)
+        values = torch.cat([picture["color"], picture["alpha"][..., None]], dim=-1)
+        mean = torch.nn.functional.avg_pool2d(values.movedim(-1, 0)[None], RAYS)[0].movedim(0, -1)
+        scores.add(view.frame, mean[..., :3], mean[..., 3])
+    return scores.by_name
 
 
 def _peer_scores(
@@ -157,7 +181,8 @@ def _table(measured: list[dict[str, Any]], options: PeersTableOptions) -> Result
     notes = (
         f"Captures: {', '.join(found['capture'] for found in measured)}; {count} test frames of "
         f"poses and cameras never seen, seeds {list(options.seeds)}; {options.steps} steps of ours "
-        f"and {options.peer_steps} of the others on the same frames and the same personal mesh. "
+        f"and {options.peer_steps} of the others on the same frames and the same personal mesh; "
+        f"ours and the mesh with {RAYS}x{RAYS} rays a pixel. "
         "Ahead: masked PSNR, decibels, paired by frame, mean over seeds [95 % over frames].",
         *(against(peer, ours) for peer in PEERS for ours in OURS),
     )

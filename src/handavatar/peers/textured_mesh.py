@@ -20,7 +20,7 @@ from handavatar.render.rasterize import interpolate, rasterize
 
 NUM_TEXELS = 30_000
 """A texel each 1.3 mm: finer than the pictures' pixels."""
-_RAYS = 2
+RAYS = 2
 """Of a pixel in each direction: the outline is as smooth as ours."""
 _PIXELS, _RATE = 4096, 3e-2
 
@@ -77,14 +77,14 @@ def mesh_points(avatar: HandAvatar, texels: SurfacePoints, frame: Frame) -> Mesh
     """Rasterises the personal mesh in the frame's pose."""
     posed = avatar.personal(frame.pose).posed(frame.pose)
     camera = frame.camera
-    fine = camera.resized(_RAYS * camera.width, _RAYS * camera.height)
+    fine = camera.resized(RAYS * camera.width, RAYS * camera.height)
     fragments = rasterize(posed.vertices, avatar.rig.faces, fine)
     y, x = fragments.mask.nonzero().unbind(-1)
     normals = vertex_normals(posed.vertices, avatar.rig.faces)
     values = torch.cat([posed.vertices, normals], dim=-1)
     found = interpolate(fragments, avatar.rig.faces, values)[y, x]
     neighbours = nearest_anchors(texels.positions(posed.vertices), found[:, :3])
-    pixels = (y // _RAYS) * camera.width + x // _RAYS
+    pixels = (y // RAYS) * camera.width + x // RAYS
     return MeshPoints(pixels, neighbours, nn.functional.normalize(found[:, 3:], dim=-1))
 
 
@@ -132,7 +132,7 @@ def fit_textured_mesh(
     def picture(frame: Frame) -> Tensor:
         points = mesh_points(avatar, texels, frame)
         values = mesh(points.neighbours, points.normals).clamp(0, 1)
-        values = torch.cat([values, torch.ones_like(values[:, :1])], dim=-1) / _RAYS**2
+        values = torch.cat([values, torch.ones_like(values[:, :1])], dim=-1) / RAYS**2
         flat = values.new_zeros(frame.camera.height * frame.camera.width, 4)
         flat.index_add_(0, points.pixels, values)
         return flat.view(frame.camera.height, frame.camera.width, 4)
