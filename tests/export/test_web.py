@@ -204,4 +204,4 @@ def test_the_page_s_joints_are_named_as_webxr_names_them(
 def test_the_whole_effort_is_that_of_the_documents(small_avatar: HandAvatar, rig: Rig) -> None:
     traced = HandAvatar(rig, torch.zeros(10), rounds=0, num_anchors=16, cues=TracedCues(4))
     assert Effort.for_avatar(small_avatar) == Effort(420, 3000)
-    assert Effort.for_avatar(traced) == Effort(140, 3000)
+    assert Effort.for_avatar(traced) == Effort(280, 3000)
