@@ -8,7 +8,7 @@ import torch
 from handavatar.avatar import HandAvatar
 from handavatar.edit import Edit, Paint
 from handavatar.export.capsules import fit_capsules
-from handavatar.export.correctives import NUM_FEATURES, fit_correctives, pose_features
+from handavatar.export.correctives import fit_correctives
 from handavatar.export.field_samples import FieldSamples, sample_field, sampled_poses
 from handavatar.export.lightweight import (
     Effort,
@@ -28,6 +28,7 @@ from handavatar.field.anchors import nearest_anchors
 from handavatar.field.shading import TracedCues
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.hand.pose import FINGER_BONES, NUM_BONES, HandPose
+from handavatar.hand.pose_features import NUM_POSE_FEATURES, pose_features
 from handavatar.hand.rig import Rig
 
 EFFORT = Effort(poses=8, steps=60)
@@ -109,7 +110,7 @@ def _made_samples(rig: Rig, count: int) -> FieldSamples:
     """Poses whose rest shape is linear in their features, of rank three."""
     generator = torch.Generator().manual_seed(4)
     rotations = 0.5 * torch.randn(count, NUM_BONES, 3, generator=generator)
-    drive = torch.randn(NUM_FEATURES, 3, generator=generator)
+    drive = torch.randn(NUM_POSE_FEATURES, 3, generator=generator)
     shapes = 1e-3 * torch.randn(3, rig.num_vertices, 3, generator=generator)
     hand = rig.shaped()
     amounts = pose_features(rotations) @ drive / 10

@@ -6,7 +6,6 @@ weights are for bodies and play no part in its cost, so they stay as they are ma
 
 from collections.abc import Callable
 from importlib import import_module
-from importlib.util import find_spec
 from unittest.mock import patch
 
 import torch
@@ -36,14 +35,11 @@ def published_coap_query(boxes: PartBoxes) -> Query | str:
     the point.
     """
     try:
-        is_there = find_spec("coap.coap") is not None
-    except ModuleNotFoundError:
-        is_there = False
-    if not is_there:
-        return "COAP's code (github.com/markomih/COAP) is not installed"
-    try:
         published = import_module("coap.coap")
     except ImportError as error:
+        # The name is also that of unrelated packages, which hold no such module.
+        if error.name in ("coap", "coap.coap"):
+            return "COAP's code (github.com/markomih/COAP) is not installed"
         return f"COAP's code cannot be imported ({error})"
     num_parts = len(boxes.lower)
     with patch.object(published, "Partitioner", lambda _: _PartsOfAHand(num_parts)):

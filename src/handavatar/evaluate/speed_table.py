@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -521,11 +522,9 @@ def _query_note(
         spent = _best_seconds(lambda: [query(piece) for piece in pieces], avatar.device, tries=3)
         return 1e6 * spent / num_points
 
-    ours = microseconds(lambda all_of_them: avatar.occupancy(state.codes, all_of_them), num_points)
-    plain = min(
-        microseconds(lambda piece: avatar.occupancy.plain(state.codes, piece), count)
-        for count in counts
-    )
+    ours = microseconds(partial(avatar.occupancy, state.codes), num_points)
+    reference = partial(avatar.occupancy.plain, state.codes)
+    plain = min(microseconds(reference, count) for count in counts)
     told = (
         f"Occupancy at {num_points} places in the box around a hand: {ours:.2f} microseconds a "
         f"place, the plain reference {plain:.2f}"

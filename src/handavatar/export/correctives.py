@@ -13,12 +13,10 @@ from torch import Tensor
 
 from handavatar.export.field_samples import FieldSamples
 from handavatar.geometry.meshes import Subdivision, carried_to_fine, vertex_normals
-from handavatar.hand.pose import NUM_BONES
 from handavatar.hand.pose_features import pose_features
 from handavatar.hand.rig import Rig, ShapedHand
 
 NUM_SHAPES = 12
-NUM_FEATURES = 9 * (NUM_BONES - 1)
 _DAMPING = 1.0
 """Of the regression from pose to shapes, in squared units of its features."""
 

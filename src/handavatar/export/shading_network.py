@@ -14,12 +14,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from handavatar.export.capsules import Capsules, occlusion_by_bones
-from handavatar.export.correctives import NUM_FEATURES
 from handavatar.export.field_samples import FieldSamples
 from handavatar.geometry.meshes import Subdivision, carried_to_fine
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import NUM_BONES, HandPose
-from handavatar.hand.pose_features import pose_features
+from handavatar.hand.pose_features import NUM_POSE_FEATURES, pose_features
 from handavatar.hand.rig import PosedHand, ShapedHand
 
 NUM_LATENTS = 8
@@ -47,7 +46,7 @@ class ShadingNetwork(nn.Module):
         """
         super().__init__()
         self.latents = nn.Parameter(0.1 * torch.randn(num_vertices, NUM_LATENTS))
-        self.pose_hidden = nn.Linear(NUM_FEATURES + 6, POSE_WIDTH)
+        self.pose_hidden = nn.Linear(NUM_POSE_FEATURES + 6, POSE_WIDTH)
         self.pose_output = nn.Linear(POSE_WIDTH, WIDTH)
         self.first = nn.Linear(NUM_LATENTS + 3 + 2 * NUM_BONES, WIDTH, bias=False)
         self.second = nn.Linear(WIDTH, WIDTH)

@@ -5,6 +5,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.hand.pose import NUM_BONES
+
+NUM_POSE_FEATURES = 9 * (NUM_BONES - 1)
 
 
 def pose_features(rotations: Float[Tensor, "*batch bones 3"]) -> Float[Tensor, "*batch 135"]:

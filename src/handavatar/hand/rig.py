@@ -15,16 +15,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.geometry.meshes import boundary_loop
-from handavatar.hand.pose import (
-    NUM_BONES,
-    HandPose,
-    bone_transforms,
-    linear_blend_skinning,
-)
-from handavatar.hand.pose_features import pose_features
-
-_NUM_POSE_FEATURES = 9 * (NUM_BONES - 1)
-
+from handavatar.hand.pose import NUM_BONES, HandPose, bone_transforms, linear_blend_skinning
+from handavatar.hand.pose_features import NUM_POSE_FEATURES, pose_features
 
 RIG_ARRAYS = (
     "template_vertices",
@@ -90,11 +82,11 @@ class Rig:
         if self.pose_directions.numel() == 0:
             none = self.template_vertices.new_zeros(num_vertices, 3, 0)
             object.__setattr__(self, "pose_directions", none)
-        elif self.pose_directions.shape != (num_vertices, 3, _NUM_POSE_FEATURES):
+        elif self.pose_directions.shape != (num_vertices, 3, NUM_POSE_FEATURES):
             raise RigError(
                 f"rig {self.name}: pose_directions have shape "
                 f"{tuple(self.pose_directions.shape)}, expected "
-                f"({num_vertices}, 3, {_NUM_POSE_FEATURES})"
+                f"({num_vertices}, 3, {NUM_POSE_FEATURES})"
             )
         if self.skin_weights.shape != (num_vertices, NUM_BONES):
             raise RigError(

@@ -1,12 +1,14 @@
 """``handavatar bench --table peers``: prior art and ours on the same frames and the same hand."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from handavatar.avatar import RenderSettings
 from handavatar.capture.checks import load_json
@@ -104,11 +106,14 @@ def _measured(
     rows: dict[str, dict[str, Any]] = {}
     for seed in options.seeds:
         for name in PEERS:
-            rows.setdefault(name, {})[str(seed)] = _peer_scores(name, geometry, options, seed)
+            picture = _fitted_peer(name, geometry, options, seed)
+            pictures = (picture(view.frame) for view in geometry.views)
+            rows.setdefault(name, {})[str(seed)] = _scores(pictures, geometry)
             finished()
         for name, part in OURS.items():
             shading = trained_shading(ROWS[part], geometry, method, options.steps, seed)
-            rows.setdefault(name, {})[str(seed)] = _our_scores(shading, views, geometry)
+            pictures = (_smooth_picture(shading, view) for view in views)
+            rows.setdefault(name, {})[str(seed)] = _scores(pictures, geometry)
             finished()
     return rows
 
@@ -119,35 +124,34 @@ def _finer_view(geometry: FittedGeometry, frame: Frame, num_samples: int) -> Vie
     return view_of_frame(geometry.avatar, frame, camera, RenderSettings(num_samples=num_samples))
 
 
-def _our_scores(
-    shading: Shading, views: list[View], geometry: FittedGeometry
-) -> dict[str, list[float]]:
-    scores = FrameScores()
-    for fine, view in zip(views, geometry.views, strict=True):
-        picture = shaded_view(shading, fine)
-        values = torch.cat([picture["color"], picture["alpha"][..., None]], dim=-1)
-        mean = torch.nn.functional.avg_pool2d(values.movedim(-1, 0)[None], RAYS)[0].movedim(0, -1)
-        scores.add(view.frame, mean[..., :3], mean[..., 3])
-    return scores.by_name
+def _smooth_picture(shading: Shading, fine: View) -> Float[Tensor, "height width 4"]:
+    """Colour on black and coverage, the means over the rays of each pixel."""
+    picture = shaded_view(shading, fine)
+    values = torch.cat([picture["color"], picture["alpha"][..., None]], dim=-1)
+    return torch.nn.functional.avg_pool2d(values.movedim(-1, 0)[None], RAYS)[0].movedim(0, -1)
 
 
-def _peer_scores(
+def _fitted_peer(
     name: str, geometry: FittedGeometry, options: PeersTableOptions, seed: int
-) -> dict[str, list[float]]:
+) -> Callable[[Frame], Float[Tensor, "height width 4"]]:
     avatar, frames, steps = geometry.avatar, geometry.frames, options.peer_steps
     if name == "textured mesh":
-        picture = fit_textured_mesh(avatar, frames, geometry.color, steps, seed)
-    else:
-        picture = fit_inverse_skinning(avatar, frames, steps, seed)
+        return fit_textured_mesh(avatar, frames, geometry.color, steps, seed)
+    return fit_inverse_skinning(avatar, frames, steps, seed)
+
+
+def _scores(
+    pictures: Iterable[Float[Tensor, "height width 4"]], geometry: FittedGeometry
+) -> dict[str, list[float]]:
+    """Of one picture of every test frame, in order."""
     scores = FrameScores()
-    for view in geometry.views:
-        values = picture(view.frame)
+    for values, view in zip(pictures, geometry.views, strict=True):
         scores.add(view.frame, values[..., :3], values[..., 3])
     return scores.by_name
 
 
 def _table(measured: list[dict[str, Any]], options: PeersTableOptions) -> ResultTable:
-    def of_frames(name: str, key: str) -> torch.Tensor:
+    def of_frames(name: str, key: str) -> Tensor:
         parts = [
             torch.tensor([values[key] for values in found["rows"][name].values()]).mean(0)
             for found in measured

@@ -152,12 +152,10 @@ def pixels_in_boxes(
     Yields:
         Batches of (box, x, y), so that few pairs are in memory at once.
     """
-    size = lower.new_tensor([width, height])
-    first = (lower - 0.5).ceil().clamp_min(0).minimum(size)
-    last = (upper - 0.5).floor().clamp_min(-1).minimum(size - 1)
-    extent = (last - first + 1).clamp_min(0).long()
+    first, end = pixel_ranges(lower, upper, width, height)
+    extent = end - first
     box = (extent.prod(-1) > 0).nonzero()[:, 0]
-    first, extent = first[box].long(), extent[box]
+    first, extent = first[box], extent[box]
     count = extent.prod(-1)
     batch = (count.cumsum(0) - count) // _PAIRS_AT_ONCE
     start = 0
@@ -169,6 +167,24 @@ def pixels_in_boxes(
         x = first[chosen][row, 0] + rank % columns
         y = first[chosen][row, 1] + torch.div(rank, columns, rounding_mode="floor")
         yield box[chosen][row], x, y
+
+
+def pixel_ranges(
+    lower: Float[Tensor, "boxes 2"], upper: Float[Tensor, "boxes 2"], width: int, height: int
+) -> tuple[Int[Tensor, "boxes 2"], Int[Tensor, "boxes 2"]]:
+    """The first column and row of the pixels whose centres lie in each box, and those after them.
+
+    Args:
+        lower: smallest (x, y) of each box, pixels; what is not a number makes an empty box.
+        upper: largest (x, y).
+        width: image width; the boxes are clipped to the image.
+        height: image height.
+    """
+    size = lower.new_tensor([width, height])
+    # Clamped once more as integers, which numbers that are none become.
+    first = (lower - 0.5).ceil().clamp_min(0).minimum(size).long().clamp_min(0)
+    end = ((upper - 0.5).floor() + 1).clamp_min(0).minimum(size).long()
+    return first, end.maximum(first)
 
 
 def numbered_copies(
@@ -189,7 +205,7 @@ def weights_in_image(
     """
     doubled_areas = _doubled_areas(corners, points)
     total = doubled_areas.sum(-1)
-    holds = _is_one_sided(doubled_areas) & (total != 0)
+    holds = _holds(doubled_areas, total)
     return doubled_areas / torch.where(holds, total, 1.0)[:, None], holds
 
 
@@ -198,7 +214,7 @@ def holds_in_image(
 ) -> Bool[Tensor, "pairs"]:
     """Whether the closed triangle holds the point; the second of :func:`weights_in_image`."""
     doubled_areas = _doubled_areas(corners, points)
-    return _is_one_sided(doubled_areas) & (doubled_areas.sum(-1) != 0)
+    return _holds(doubled_areas, doubled_areas.sum(-1))
 
 
 def _doubled_areas(
@@ -209,8 +225,11 @@ def _doubled_areas(
     return torch.stack([x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0], dim=-1)
 
 
-def _is_one_sided(doubled_areas: Float[Tensor, "pairs 3"]) -> Bool[Tensor, "pairs"]:
-    return (doubled_areas.amin(-1) >= 0) | (doubled_areas.amax(-1) <= 0)
+def _holds(
+    doubled_areas: Float[Tensor, "pairs 3"], total: Float[Tensor, "pairs"]
+) -> Bool[Tensor, "pairs"]:
+    is_one_sided = (doubled_areas.amin(-1) >= 0) | (doubled_areas.amax(-1) <= 0)
+    return is_one_sided & (total != 0)
 
 
 def _fragments(

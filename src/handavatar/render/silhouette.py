@@ -19,6 +19,7 @@ from handavatar.render.rasterize import (
     holds_in_image,
     is_before_camera,
     numbered_copies,
+    pixel_ranges,
     pixels_in_boxes,
 )
 
@@ -309,11 +310,8 @@ def _holds_any(
     height, width = counts.shape
     # Entry (y, x): the sum over all pixels above and left of it.
     sums = torch.nn.functional.pad(counts.cumsum(0).cumsum(1), (1, 0, 1, 0))
-    size = lower.new_tensor([width, height])
-    # Clamped as integers too: what is not a number becomes an empty box.
-    first = (lower - 0.5).ceil().clamp_min(0).minimum(size).long().clamp_min(0)
-    end = ((upper - 0.5).floor() + 1).clamp_min(0).minimum(size).long().clamp_min(0)
-    (left, top), (right, bottom) = first.T, end.maximum(first).T
+    first, end = pixel_ranges(lower, upper, width, height)
+    (left, top), (right, bottom) = first.T, end.T
     within = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
     return within > 0
 

@@ -22,13 +22,16 @@ class Busy(Exception):
 class Job:
     """A picture that somebody waits for."""
 
-    def __init__(self, client: str, order: int, work: Callable[["Job"], Any]) -> None:
+    def __init__(
+        self, client: str, order: int, work: Callable[["Job"], Any], share: Share | None = None
+    ) -> None:
         """Not begun.
 
         Args:
             client: who asks.
             order: of the client's wishes; a larger one is newer.
             work: makes the picture; gets the job, to ask now and then whether it is stale.
+            share: of a core, if there is one to be kept to.
         """
         self.client = client
         self.order = order
@@ -37,7 +40,7 @@ class Job:
         self._stale = threading.Event()
         self._result: Any = None
         self._error: BaseException | None = None
-        self._share: Share | None = None
+        self._share = share
 
     def is_stale(self) -> bool:
         """Whether nobody wants it any more."""
@@ -69,13 +72,8 @@ class Job:
             raise self._error
         return self._result
 
-    def run(self, share: Share | None = None) -> None:
-        """Does the work, unless it is stale; never raises.
-
-        Args:
-            share: of a core, if there is one to be kept to.
-        """
-        self._share = share
+    def run(self) -> None:
+        """Does the work, unless it is stale; never raises."""
         try:
             if not self.is_stale():
                 self._result = self._work(self)
@@ -135,7 +133,7 @@ class Turns:
             Overtaken: if the client has asked for something newer, or all is closed.
             Busy: if too many wait.
         """
-        job = Job(client, order, work)
+        job = Job(client, order, work, self._share)
         with self._changed:
             if self._is_closed or order < self._newest.get(client, order):
                 raise Overtaken
@@ -181,7 +179,7 @@ class Turns:
                     return
                 job = waiting.popitem(last=False)[1]
                 self._running[lane] = job
-            job.run(self._share)
+            job.run()
             with self._changed:
                 self._running[lane] = None
             if self._share is not None:
