@@ -1,6 +1,10 @@
 """What several tests need: a small avatar, and a capture of a few small pictures."""
 
 import math
+import os
+import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -168,6 +172,23 @@ def small_avatar() -> HandAvatar:
         avatar.albedo.codes.mul_(10)
         avatar.shape.mlp.output.weight.mul_(100 / math.sqrt(3))
     return avatar
+
+
+def passed_kernel_checks(checks: Path) -> int:
+    """How many tests of Triton kernels a file holds; all must pass.
+
+    In a process of their own, on the GPU, else in Triton's interpreter: Triton must know before its
+    import that it is to interpret, and cannot read functions that the type checker has wrapped.
+    """
+    environment = {**os.environ, "TRITON_INTERPRET": "0" if torch.cuda.is_available() else "1"}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", "-p", "no:cacheprovider"]
+    done = subprocess.run(
+        [*command, str(checks)], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-2000:]
+    passed = re.search(r"(\d+) passed", done.stdout)
+    assert passed, done.stdout[-500:]
+    return int(passed[1])
 
 
 def any_pose(rig: Rig, turn: float = 0.0, shift: float = 0.0) -> PosedHand:

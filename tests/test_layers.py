@@ -7,8 +7,8 @@ from source_tree import imported_modules, modules
 
 # Left: a folder or top module. Right: what it may import besides itself.
 EVERYTHING_BELOW = (
-    "geometry hand capture field render edit avatar plain retouch processes unfinished alignment "
-    "animate evaluate train peers export view demo doctor"
+    "geometry hand capture field render edit replay avatar plain retouch processes unfinished "
+    "alignment animate evaluate train peers export view demo doctor"
 )
 MAY_IMPORT = {
     name: set(allowed.split())
@@ -19,7 +19,9 @@ MAY_IMPORT = {
         "capture": "geometry hand render",
         "field": "geometry hand",
         "edit": "hand field",
-        "avatar": "geometry hand field render edit",
+        # A function's work on a GPU, recorded.
+        "replay": "",
+        "avatar": "geometry hand field render edit replay",
         # Fits a pose to a mask with any shaped hand.
         "alignment": "geometry hand render",
         # The slow renderer that the fast one is measured against.
@@ -50,7 +52,12 @@ MAY_IMPORT = {
 # Heavy or optional packages that a function may import when it needs them.
 OPTIONAL_EXTRAS = {"mediapipe", "cv2", "mitsuba", "drjit"}
 # Modules that import such a package (triton) at their top.
-OPTIONAL_MODULES = {"handavatar.field.fused", "handavatar.field.fused_anchors"}
+OPTIONAL_MODULES = {
+    "handavatar.field.fused",
+    "handavatar.field.fused_anchors",
+    "handavatar.render.fused_coverage",
+    "handavatar.render.fused_rays",
+}
 FORBIDDEN_NAMES = {"utils", "util", "misc", "helpers", "common", "base", "manager"}
 
 

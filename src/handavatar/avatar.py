@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,8 +21,8 @@ from torch import Tensor, nn
 
 from handavatar.edit import Edit, Paint
 from handavatar.field.anchors import Neighbours, nearest_anchors, place_anchors
-from handavatar.field.kernels import SHORTER, Kernel
-from handavatar.field.occupancy import HandCodes, PairItems, PairOccupancy
+from handavatar.field.kernels import SHORTER, Kernel, chosen_kernel
+from handavatar.field.occupancy import HandCodes, PairItems, PairOccupancy, decided_items
 from handavatar.field.shading import (
     AlbedoField,
     CueSet,
@@ -43,6 +43,10 @@ from handavatar.render.rasterize import covered_pixels
 from handavatar.render.sampling import depths_along, intervals_through_boxes
 from handavatar.render.skylight import even_directions, sky_light
 from handavatar.render.volume import composite_sparse, visibility
+from handavatar.replay import Replay
+
+if TYPE_CHECKING:
+    from handavatar.field.fused import Decided
 
 SCHEMA = 5
 START_LIGHT = 0.65
@@ -257,6 +261,7 @@ class HandAvatar(nn.Module):
         self.illumination = IlluminationField(
             anchors.positions(self.rig.template_vertices), cues or PaperCues()
         )
+        self._replay: Replay[HandState] = Replay()
         if count := self.illumination.chosen.num_directions:
             self.illumination.directions.copy_(even_directions(count))
 
@@ -312,20 +317,31 @@ class HandAvatar(nn.Module):
             pose: of the hand in the world.
             lifted_bones: bones that shall cast no shadow, where light is traced.
         """
+        if self.device.type == "cuda" and not torch.is_grad_enabled():
+            state = self._replay(
+                self._unlit_state,
+                (pose.rotations, pose.translation),
+                _copied_state,
+                (self.rig, self.parts, *self.parameters(), *self.buffers()),
+                (self.occupancy.margin,),
+            )
+        else:
+            state = self._unlit_state(pose.rotations, pose.translation)
+        light = self._light_on(state.posed, state.anchors, state.anchor_normals, lifted_bones)
+        return replace(state, posed=replace(state.posed, pose=pose), light=light)
+
+    def _unlit_state(
+        self, rotations: Float[Tensor, "bones 3"], translation: Float[Tensor, "3"]
+    ) -> HandState:
+        """The state of a pose without any traced light."""
         rest = self.rig.shaped(self.coefficients)
-        offsets = self.shape(rest, pose.rotations)
-        posed = personal_hand(rest, offsets).posed(pose)
+        offsets = self.shape(rest, rotations)
+        posed = personal_hand(rest, offsets).posed(HandPose(rotations, translation))
         normals = self.anchors.positions(vertex_normals(posed.vertices, self.rig.faces))
         normals = torch.nn.functional.normalize(normals, dim=-1)
         places = self.anchors.positions(posed.vertices)
-        return HandState(
-            posed,
-            offsets,
-            self.occupancy.encode(self.parts, posed),
-            places,
-            normals,
-            self._light_on(posed, places, normals, lifted_bones),
-        )
+        codes = self.occupancy.encode(self.parts, posed)
+        return HandState(posed, offsets, codes, places, normals, places.new_zeros(len(places), 0))
 
     def _light_on(
         self,
@@ -413,13 +429,13 @@ class HandAvatar(nn.Module):
         generator: torch.Generator | None = None,
     ) -> VisibleSamples:
         """The samples that weigh something in their ray; see :meth:`render_rays`."""
+        settings = replace(settings, kernel=_kernel(settings.kernel, self.device))
         hit, rays_hit, depths = _sampled(state.codes, rays, settings, generator)
         weights, kept, directed = self._weighed(state.codes, rays_hit, depths, settings)
         ray, sample = kept.unbind(-1)
-        along = depths[ray, sample]
-        points = rays_hit.origins[ray] + along[:, None] * rays_hit.directions[ray]
+        points = _places(rays_hit, depths, kept)
         neighbours = nearest_anchors(state.anchors, points, kernel=settings.kernel)
-        return VisibleSamples(weights, hit[ray], along, directed, neighbours)
+        return VisibleSamples(weights, hit[ray], depths[ray, sample], directed, neighbours)
 
     def alpha(
         self,
@@ -429,6 +445,7 @@ class HandAvatar(nn.Module):
         generator: torch.Generator | None = None,
     ) -> Float[Tensor, "rays"]:
         """The alpha of :meth:`render_rays` alone, with the same gradient: nothing is shaded."""
+        settings = replace(settings, kernel=_kernel(settings.kernel, self.device))
         hit, rays_hit, depths = _sampled(codes, rays, settings, generator)
         weights, kept, _ = self._weighed(codes, rays_hit, depths, settings)
         return weights.new_zeros(len(rays.origins)).index_add(0, hit[kept[:, 0]], weights)
@@ -441,24 +458,83 @@ class HandAvatar(nn.Module):
         settings: RenderSettings,
     ) -> tuple[Float[Tensor, "kept"], Int[Tensor, "kept 2"], Float[Tensor, "kept bones"]]:
         """Weights of the samples that can be seen, which they are, and what lies before them."""
-        num_rays, num_samples = depths.shape
+        if self.occupancy.is_fused(settings.kernel):
+            return self._weighed_fused(codes, rays, depths, settings)
         occupancy, soft, items = self._march(codes, rays, depths, settings)
         is_kept = visibility(occupancy) > settings.smallest_weight
         kept = is_kept.nonzero()
-        directed = directed_occupancy(soft)[is_kept]
-        # What shorter factors have only found is evaluated again where it can be seen.
-        if torch.is_grad_enabled() or settings.kernel in SHORTER:
-            position = torch.full((num_rays * num_samples,), -1, device=depths.device)
+        if torch.is_grad_enabled():
+            position = torch.full((depths.numel(),), -1, device=depths.device)
             position[is_kept.flatten()] = torch.arange(len(kept), device=depths.device)
             item_position = position[items.points]
             is_used = item_position >= 0
             used = PairItems(item_position[is_used], items.pairs[is_used], items.is_wanted[is_used])
-            ray, sample = kept.unbind(-1)
-            points = rays.origins[ray] + depths[ray, sample][:, None] * rays.directions[ray]
-            kernel: Kernel = "torch" if torch.is_grad_enabled() else settings.kernel
-            again = self.occupancy.of_items(codes, points, used, kernel)
-            occupancy = occupancy.index_put((ray, sample), again)
-        return visibility(occupancy)[is_kept], kept, directed
+            again = self.occupancy.of_items(codes, _places(rays, depths, kept), used)
+            occupancy = occupancy.index_put(kept.unbind(-1), again)
+        return visibility(occupancy)[is_kept], kept, directed_occupancy(soft)[is_kept]
+
+    def _weighed_fused(
+        self,
+        codes: HandCodes,
+        rays: Rays,
+        depths: Float[Tensor, "rays samples"],
+        settings: RenderSettings,
+    ) -> tuple[Float[Tensor, "kept"], Int[Tensor, "kept 2"], Float[Tensor, "kept bones"]]:
+        """:meth:`_weighed` by kernels. What shorter factors have only found is evaluated again."""
+        from handavatar.render.fused_rays import largest_met, sample_weights
+
+        decided = self._march_fused(codes, rays, depths, settings)
+        occupancy = decided.whole.view_as(depths)
+        weights = sample_weights(occupancy)
+        samples = (weights.flatten() > settings.smallest_weight).nonzero()[:, 0]
+        ray = samples // depths.shape[1]
+        kept = torch.stack([ray, samples - ray * depths.shape[1]], dim=-1)
+        directed = largest_met(decided.soft.view(*depths.shape, -1), samples)
+        if not torch.is_grad_enabled() and settings.kernel not in SHORTER:
+            return weights.flatten()[samples], kept, directed
+        points, deciders = _places(rays, depths, kept), decided.deciders[samples]
+        if torch.is_grad_enabled():
+            items = decided_items(torch.arange(len(kept), device=depths.device), deciders)
+            again = self.occupancy.of_items(codes, points, items)
+            weights = visibility(occupancy.index_put(kept.unbind(-1), again))
+        else:
+            again = self.occupancy.whole_again(codes, points, deciders)
+            weights = sample_weights(decided.whole.index_copy_(0, samples, again).view_as(depths))
+        return weights.flatten()[samples], kept, directed
+
+    @torch.no_grad()
+    def _march_fused(
+        self,
+        codes: HandCodes,
+        rays: Rays,
+        depths: Float[Tensor, "rays samples"],
+        settings: RenderSettings,
+    ) -> "Decided":
+        """:meth:`_march` by kernels; of all samples, by their numbers."""
+        from handavatar.render.fused_rays import dim, sample_places, samples_between
+
+        num_rays, num_samples = depths.shape
+        decided = self.occupancy.nothing_decided(codes, depths.numel())
+        occupancy = decided.whole.view_as(depths)
+        light = depths.new_ones(num_rays)
+        first = torch.arange(0, depths.numel(), num_samples, device=depths.device)[:, None]
+
+        def evaluate(samples: Int[Tensor, "samples"], stop: float) -> None:
+            points = sample_places(rays, depths, samples, light, stop)
+            self.occupancy.decide(codes, points, settings.kernel, decided, samples)
+
+        stride, group = _steps(settings, depths)
+        looked_at = _looked_at(num_samples, stride, depths.device)
+        for window in looked_at.split(group):
+            evaluate((first + window).flatten(), settings.stop)
+            dim(light, occupancy, window)
+        if stride > 1:
+            soft = decided.soft.view(*depths.shape, -1)
+            evaluate(
+                samples_between(occupancy, soft, looked_at, settings.refine_above, settings.stop),
+                -1.0,
+            )
+        return decided
 
     def _march(
         self,
@@ -481,16 +557,13 @@ class HandAvatar(nn.Module):
         def evaluate(flat: Int[Tensor, "samples"]) -> None:
             ray = flat // num_samples
             points = rays.origins[ray] + depths.view(-1)[flat][:, None] * rays.directions[ray]
-            result = self.occupancy(codes, points, settings.kernel)
+            result = self.occupancy(codes, points, "torch")
             occupancy.view(-1)[flat] = result.whole
             soft.view(-1, soft.shape[-1])[flat] = result.soft_parts
             found.append(replace(result.items, points=flat[result.items.points]))
 
-        last = num_samples - 1
-        stride, group = settings.coarse, settings.group
-        if depths.device.type != "cpu" and depths.numel() <= _FEW_ON_A_GPU:
-            stride, group = 1, num_samples
-        coarse = torch.tensor(sorted({*range(0, num_samples, stride), last}), device=depths.device)
+        stride, group = _steps(settings, depths)
+        coarse = _looked_at(num_samples, stride, depths.device)
         light = depths.new_ones(num_rays)
         alive = torch.arange(num_rays, device=depths.device)
         for window in coarse.split(group):
@@ -536,11 +609,12 @@ class HandAvatar(nn.Module):
         self, state: HandState, camera: Camera, edit: Edit | None, settings: RenderSettings
     ) -> Rendering:
         camera = camera.to(self.device)
-        near = self.near_mesh(state, camera, settings.mask_margin).flatten().nonzero()[:, 0]
+        near = self.near_mesh(state, camera, settings.mask_margin, settings.kernel)
+        near = near.flatten().nonzero()[:, 0]
         centers = pixel_centers(camera).flatten(0, 1)
         size = (camera.height, camera.width)
         flat = {
-            name: values.new_zeros(camera.height * camera.width, *values.shape[1:]).index_copy(
+            name: values.new_zeros(camera.height * camera.width, *values.shape[1:]).index_copy_(
                 0, near, values
             )
             for name, values in self._along(state, camera, centers[near], settings, edit).items()
@@ -553,7 +627,7 @@ class HandAvatar(nn.Module):
             inside = (centers[edge][:, None] + offsets).flatten(0, 1)
             for name, values in self._along(state, camera, inside, settings, edit).items():
                 mean = values.unflatten(0, (len(edge), len(offsets))).mean(1)
-                flat[name] = flat[name].index_copy(0, edge, mean)
+                flat[name].index_copy_(0, edge, mean)
         channels = {name: values.unflatten(0, size) for name, values in flat.items()}
         return Rendering(**channels)
 
@@ -601,7 +675,8 @@ class HandAvatar(nn.Module):
             pixels: their numbers, row by row.
             settings: samples and bounds; ``edge_rays`` plays no part.
         """
-        is_seen = self.near_mesh(state, camera, settings.mask_margin).flatten()[pixels]
+        is_seen = self.near_mesh(state, camera, settings.mask_margin, settings.kernel)
+        is_seen = is_seen.flatten()[pixels]
         rays = rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1)[pixels])
         values = vars(self.render_rays(state, rays, settings))
         return RayValues(
@@ -632,12 +707,17 @@ class HandAvatar(nn.Module):
 
     @torch.no_grad()
     def near_mesh(
-        self, state: HandState, camera: Camera, margin: float
+        self, state: HandState, camera: Camera, margin: float, kernel: Kernel = "auto"
     ) -> Bool[Tensor, "height width"]:
         """Pixels within ``margin`` (a share of the picture's width) of the posed mesh."""
         if math.isinf(margin):
             return torch.ones(camera.height, camera.width, dtype=torch.bool, device=self.device)
-        covered = covered_pixels(state.posed.vertices, self.rig.faces, camera)
+        if _kernel(kernel, self.device) == "torch":
+            covered = covered_pixels(state.posed.vertices, self.rig.faces, camera)
+        else:
+            from handavatar.render.fused_coverage import mesh_coverage
+
+            covered = mesh_coverage(state.posed.vertices, self.rig.faces, camera)
         radius = math.ceil(margin * camera.width)
         # Two one-dimensional maxima make a square; it holds the disc of the same radius.
         grown = covered[None, None].float()
@@ -774,17 +854,61 @@ def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     return about, tensors
 
 
+def _copied_state(state: HandState) -> HandState:
+    """The same with tensors of its own, but for the pose, which its caller knows."""
+    posed = replace(state.posed, **_clones(state.posed, "vertices", "world_from_bone"))
+    names = ("bone_from_world", "lower", "upper", "cut_point", "cut_normal")
+    boxes = replace(state.codes.boxes, **_clones(state.codes.boxes, *names))
+    codes = HandCodes(state.codes.part_codes.clone(), boxes)
+    own = _clones(state, "offsets", "anchors", "anchor_normals", "light")
+    return replace(state, posed=posed, codes=codes, **own)
+
+
+def _clones(holder: object, *names: str) -> dict[str, Any]:
+    return {name: getattr(holder, name).clone() for name in names}
+
+
 def _sampled(
     codes: HandCodes, rays: Rays, settings: RenderSettings, generator: torch.Generator | None
 ) -> tuple[Int[Tensor, "hit"], Rays, Float[Tensor, "hit samples"]]:
     """The rays that meet the hand's part boxes: their numbers, themselves, depths along them."""
     boxes = codes.boxes
-    near, far, is_hit = intervals_through_boxes(
-        rays, boxes.bone_from_world, boxes.lower - boxes.margin, boxes.upper + boxes.margin
-    )
+    where = boxes.bone_from_world, boxes.lower - boxes.margin, boxes.upper + boxes.margin
+    if settings.kernel == "torch":
+        near, far, is_hit = intervals_through_boxes(rays, *where)
+    else:
+        from handavatar.render.fused_rays import box_intervals
+
+        near, far = box_intervals(rays, *where)
+        is_hit = near < far
     hit = is_hit.nonzero()[:, 0]
     depths = depths_along(near[hit], far[hit], settings.num_samples, generator)
     return hit, Rays(rays.origins[hit], rays.directions[hit]), depths
+
+
+def _kernel(name: Kernel, device: torch.device) -> Kernel:
+    """What decodes pairs; never ``auto``."""
+    return chosen_kernel(name, device) if name == "auto" else name
+
+
+def _steps(settings: RenderSettings, depths: Float[Tensor, "rays samples"]) -> tuple[int, int]:
+    """Which samples are evaluated first, one of so many, and how many of these at a time."""
+    if depths.device.type != "cpu" and depths.numel() <= _FEW_ON_A_GPU:
+        return 1, depths.shape[1]
+    return settings.coarse, settings.group
+
+
+def _looked_at(num_samples: int, stride: int, device: torch.device) -> Int[Tensor, "coarse"]:
+    """Every so many samples, and the last."""
+    return torch.tensor(sorted({*range(0, num_samples, stride), num_samples - 1}), device=device)
+
+
+def _places(
+    rays: Rays, depths: Float[Tensor, "rays samples"], samples: Int[Tensor, "chosen 2"]
+) -> Float[Tensor, "chosen 3"]:
+    """Where samples lie in the world: their rays, and their places in these."""
+    ray, sample = samples.unbind(-1)
+    return rays.origins[ray] + depths[ray, sample][:, None] * rays.directions[ray]
 
 
 def _is_edge(alpha: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:

@@ -1,8 +1,4 @@
-"""The Triton kernels against torch's operations, on the GPU, else in Triton's interpreter.
-
-Run by ``test_fused.py`` in a process of its own: Triton must know before its import that it is to
-interpret, and cannot read functions that the type checker has wrapped.
-"""
+"""The Triton kernels of the field against torch's operations; run by ``test_fused.py``."""
 
 from collections.abc import Callable
 

@@ -25,7 +25,7 @@ from typing import Any, cast
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from handavatar.field.kernels import Precision
@@ -303,12 +303,13 @@ def _number(ordered):
 
 @triton.jit(do_not_specialize=["count"])
 def _values(
-    points, transforms, boxes, best, winners, whole, soft, deciders, count,
+    points, transforms, boxes, best, winners, places, whole, soft, deciders, count,
     margin, softness, sharpness, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Occupancies of the largest answers; what nobody has answered is nothing."""
     index = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     is_point = index < count
+    place = tl.load(places + index, mask=is_point, other=0)
     x = tl.load(points + 3 * index, mask=is_point, other=0.0)
     y = tl.load(points + 3 * index + 1, mask=is_point, other=0.0)
     z = tl.load(points + 3 * index + 2, mask=is_point, other=0.0)
@@ -316,9 +317,9 @@ def _values(
     ordered = (winner >> 32).to(tl.int32)
     is_answered = ordered >= -2147483647
     value = tl.where(is_answered, tl.sigmoid(sharpness * _number(ordered)), 0.0)
-    tl.store(whole + index, value, mask=is_point)
+    tl.store(whole + place, value, mask=is_point)
     decider = tl.where(is_answered, (winner & 0xFFFFFFFF).to(tl.int32), -1)
-    tl.store(deciders + index, decider, mask=is_point)
+    tl.store(deciders + place, decider, mask=is_point)
     for bone in tl.static_range(_NUM_BONES):
         row, box = transforms + 12 * bone, boxes + 6 * bone
         outside = _beyond(box, 0, _along(row, x, y, z))
@@ -328,7 +329,7 @@ def _values(
         ordered = tl.load(best + _NUM_BONES * index + bone, mask=is_point, other=0)
         value = tl.sigmoid(softness * _number(ordered)) * (ramp * ramp * (3 - 2 * ramp))
         value = tl.where(ordered >= -2147483647, value, 0.0)
-        tl.store(soft + _NUM_BONES * index + bone, value, mask=is_point)
+        tl.store(soft + _NUM_BONES * place + bone, value, mask=is_point)
 
 
 def pack_weights(
@@ -426,68 +427,90 @@ def pack_hand(
     )
 
 
-def largest_logits(
+def decided_logits(
     weights: PackedWeights,
     hand: PackedHand,
     points: Float[Tensor, "points 3"],
-    item_points: Int[Tensor, "items"],
-    item_pairs: Int[Tensor, "items"],
-    is_wanted: Bool[Tensor, "items 2"],
+    deciders: Int[Tensor, "points"],
 ) -> Float[Tensor, "points"]:
-    """The largest of the wanted answers at each point, without gradient; minus infinity if none.
-
-    Args:
-        weights: packed; with ``tf32`` or ``bf16`` for looking, not for what must be exact.
-        hand: packed.
-        points: in the world, metres.
-        item_points: the point of each item.
-        item_pairs: its pair.
-        is_wanted: which of the two answers.
-
-    Source: paper Sec. 3.2 and appendix (local-pair decoder).
-    """
-    item_pairs, order = item_pairs.int().sort()
-    pair_ends = torch.bincount(item_pairs, minlength=len(hand.pairs)).cumsum(0).int()
-    answers = is_wanted[order].flatten().nonzero()[:, 0].int()
-    best, winners = _nobody(points, len(hand.transforms))
-    items = _Items(item_points[order].int(), item_pairs, answers, pair_ends)
-    _decode(weights, hand, points, items, pair_ends.tolist(), best, winners)
-    ordered = (winners >> 32).int()
-    bits = ordered ^ ((ordered >> 31) & 0x7FFFFFFF)
-    return torch.where(winners > _NOBODY, bits.view(torch.float32), -torch.inf)
-
-
-def fused_occupancy(
-    weights: PackedWeights,
-    hand: PackedHand,
-    points: Float[Tensor, "points 3"],
-    softness: float,
-    sharpness: float,
-) -> tuple[Float[Tensor, "points"], Float[Tensor, "points bones"], Int[Tensor, "points"]]:
-    """Occupancies by maximum fusion, without gradient.
+    """The answer that decides each point, without gradient; minus infinity where there is none.
 
     Args:
         weights: packed.
         hand: packed.
         points: in the world, metres.
-        softness: the paper's tau.
-        sharpness: what the logit of the whole is multiplied by.
+        deciders: as in :class:`Decided`.
 
-    Returns:
-        Of the whole, softly of each part, and twice the number of the pair that decides, plus one
-        if it is its second part; -1 where there is none.
+    Source: paper Sec. 3.2 and appendix (local-pair decoder).
+    """
+    count = len(points)
+    ordered, order = deciders.clamp_min(0).int().sort()
+    pairs = ordered // 2
+    numbers = torch.arange(max(count, len(hand.pairs)), dtype=torch.int32, device=points.device)
+    answers = 2 * numbers[:count] + ordered % 2
+    ends = torch.searchsorted(pairs, numbers[: len(hand.pairs)], right=True, out_int32=True)
+    best, winners = _nobody(points, len(hand.transforms))
+    # A pair's last tile may be filled in part, and what comes after all tiles does nothing.
+    tiles = triton.cdiv(count, _BLOCK) + len(hand.pairs)
+    _decode(weights, hand, points, _Items(order.int(), pairs, answers, ends), tiles, best, winners)
+    bits = (winners >> 32).int()
+    bits = bits ^ ((bits >> 31) & 0x7FFFFFFF)
+    return torch.where(deciders >= 0, bits.view(torch.float32), -torch.inf)
+
+
+@dataclass(frozen=True, eq=False)
+class Decided:
+    """Occupancies by maximum fusion at places, and what decides them.
+
+    Attributes:
+        whole: of the hand.
+        soft: of each part, softly.
+        deciders: twice the number of the pair that decides, plus one if it is its second part; -1
+            where there is none.
 
     Source: paper Sec. 3.2, Eq. 1, and Sec. 3.3, Eq. 3.
     """
+
+    whole: Float[Tensor, "places"]
+    soft: Float[Tensor, "places bones"]
+    deciders: Int[Tensor, "places"]
+
+    @staticmethod
+    def nothing(count: int, num_bones: int, device: torch.device) -> "Decided":
+        """No hand at so many places."""
+        return Decided(
+            torch.zeros(count, device=device),
+            torch.zeros(count, num_bones, device=device),
+            torch.full((count,), -1, dtype=torch.int32, device=device),
+        )
+
+
+def decide(
+    weights: PackedWeights,
+    hand: PackedHand,
+    points: Float[Tensor, "points 3"],
+    softness: float,
+    sharpness: float,
+    decided: Decided,
+    places: Int[Tensor, "points"],
+) -> None:
+    """Evaluates occupancies at points, without gradient.
+
+    Args:
+        weights: packed.
+        hand: packed.
+        points: in the world, metres; what is not a number is nowhere near the hand.
+        softness: the paper's tau.
+        sharpness: what the logit of the whole is multiplied by.
+        decided: takes the answers.
+        places: where it takes them.
+    """
     points = points.detach().contiguous()
-    count, num_bones, num_pairs = len(points), len(hand.transforms), len(hand.pairs)
-    whole = points.new_empty(count)
-    soft = points.new_empty(count, num_bones)
-    deciders = torch.empty(count, dtype=torch.int32, device=points.device)
+    count, num_pairs = len(points), len(hand.pairs)
     if count == 0:
-        return whole, soft, deciders
+        return
     blocks = triton.cdiv(count, _POINTS)
-    held_by = torch.empty_like(deciders)
+    held_by = torch.empty(count, dtype=torch.int32, device=points.device)
     # Items in the upper half, answers in the lower one.
     counts = torch.empty(num_pairs, count, dtype=torch.int64, device=points.device)
     _boxes[(blocks,)](
@@ -497,23 +520,23 @@ def fused_occupancy(
     ends = counts.flatten().cumsum(0)
     pair_ends = ends[count - 1 :: count]
     found = pair_ends.tolist()
-    best, winners = _nobody(points, num_bones)
+    best, winners = _nobody(points, len(hand.transforms))
     if found[-1]:
         num_items, num_answers = found[-1] >> 32, found[-1] & 0xFFFFFFFF
-        item_points, item_pairs = deciders.new_empty(num_items), deciders.new_empty(num_items)
-        answers = deciders.new_empty(num_answers)
+        item_points, item_pairs = held_by.new_empty(2, num_items)
+        answers = held_by.new_empty(num_answers)
         _listed[(blocks, num_pairs)](
             held_by, ends, counts, hand.pairs, item_points, item_pairs, answers, count,
             BLOCK=_POINTS,
         )  # fmt: skip
         items = _Items(item_points, item_pairs, answers, (pair_ends >> 32).int())
-        ends_here = [end >> 32 for end in found]
-        _decode(weights, hand, points, items, ends_here, best, winners)
+        item_ends = pairwise([0, *(end >> 32 for end in found)])
+        tiles = sum(triton.cdiv(end - begin, _BLOCK) for begin, end in item_ends)
+        _decode(weights, hand, points, items, tiles, best, winners)
     _values[(blocks,)](
-        points, hand.transforms, hand.boxes, best, winners, whole, soft, deciders, count,
-        hand.margin, softness, sharpness, BLOCK=_POINTS,
+        points, hand.transforms, hand.boxes, best, winners, places, decided.whole, decided.soft,
+        decided.deciders, count, hand.margin, softness, sharpness, BLOCK=_POINTS,
     )  # fmt: skip
-    return whole, soft, deciders
 
 
 def _nobody(
@@ -549,11 +572,11 @@ def _decode(
     hand: PackedHand,
     points: Float[Tensor, "points 3"],
     items: _Items,
-    pair_ends: list[int],
+    tiles: int,
     best: Int[Tensor, "points bones"],
     winners: Int[Tensor, "points"],
 ) -> None:
-    """Trunk and answers; notes the largest in ``best`` and ``winners``."""
+    """Trunk, in so many tiles, and answers; notes the largest in ``best`` and ``winners``."""
     constants: dict[str, Any] = {
         "num_warps": _WARPS,
         "BLOCK": _BLOCK,
@@ -562,8 +585,7 @@ def _decode(
     }
     token_type = torch.bfloat16 if weights.precision == "bf16" else torch.float32
     tokens = points.new_empty(len(items.points), 2, 64, dtype=token_type)
-    tiles = sum(triton.cdiv(end - begin, _BLOCK) for begin, end in pairwise([0, *pair_ends]))
-    if tiles:
+    if len(items.points):
         _trunk[(tiles,)](
             points.detach().contiguous(),
             items.points,

@@ -26,7 +26,7 @@ from handavatar.hand.pose import CONNECTED_PAIRS, NUM_BONES
 from handavatar.hand.rig import PosedHand
 
 if TYPE_CHECKING:
-    from handavatar.field.fused import PackedHand, PackedWeights
+    from handavatar.field.fused import Decided, PackedHand, PackedWeights
 
 CODE_WIDTH = 64
 LENGTH_SCALE = 20.0
@@ -65,6 +65,18 @@ class PairItems:
         return PairItems(
             numbers[self.points[is_kept]], self.pairs[is_kept], self.is_wanted[is_kept]
         )
+
+
+def decided_items(points: Int[Tensor, "items"], deciders: Int[Tensor, "items"]) -> PairItems:
+    """The pairs and the sides of them that decide points, as items.
+
+    Args:
+        points: their numbers.
+        deciders: twice the number of a pair, plus one for its second part.
+    """
+    deciders = deciders.long()
+    is_wanted = torch.nn.functional.one_hot(deciders % 2, 2).bool()
+    return PairItems(points, deciders // 2, is_wanted)
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,7 +261,7 @@ class PairOccupancy(nn.Module):
         self.connections = connections
         self.sharpness = sharpness
         self._packed: dict[Precision, tuple[tuple[object, ...], PackedWeights]] = {}
-        self._hands: WeakKeyDictionary[HandCodes, tuple[PackedWeights, PackedHand]] = (
+        self._hands: WeakKeyDictionary[HandCodes, tuple[tuple[object, ...], PackedHand]] = (
             WeakKeyDictionary()
         )
         self.register_buffer("pairs", torch.tensor(connections), persistent=False)
@@ -264,12 +276,14 @@ class PairOccupancy(nn.Module):
         """Occupancy at world points (metres), without gradient; the fast way."""
         if kernel == "auto":
             kernel = chosen_kernel(kernel, points.device)
+        if self.is_fused(kernel):
+            with torch.no_grad():
+                return self._fused_occupancy(codes, points, kernel)
         # A core's cache wants small pieces; a GPU wants large ones, one after the other.
-        pieces_at_once = 1 if points.device.type == "cpu" else 128 if kernel == "torch" else 1024
-        chunk = pieces_at_once * self.chunk
+        chunk = self.chunk * (1 if points.device.type == "cpu" else 128)
         starts = range(0, max(len(points), 1), chunk)
         chunks = [points[start : start + chunk] for start in starts]
-        pieces = mapped(lambda piece: self._chunk_occupancy(codes, piece, kernel), chunks)
+        pieces = mapped(lambda piece: self._chunk_occupancy(codes, piece), chunks)
         if len(pieces) == 1:
             return pieces[0]
         items = PairItems(
@@ -294,7 +308,6 @@ class PairOccupancy(nn.Module):
         codes: HandCodes,
         points: Float[Tensor, "points 3"],
         items: PairItems,
-        kernel: Kernel = "torch",
     ) -> Float[Tensor, "points"]:
         """Occupancy with gradient, from the given pairs alone.
 
@@ -305,10 +318,7 @@ class PairOccupancy(nn.Module):
             codes: of the posed hand.
             points: world, metres.
             items: of these points.
-            kernel: any but ``torch`` gives no gradient; factors are long with all of them.
         """
-        if kernel != "torch" and isinstance(self.fusion, MaximumFusion):
-            return soft_occupancy(self._largest_logits(codes, points, items), self.sharpness)
         logits = self.wanted_logits(codes, points, items)
         slots = (items.points[:, None] * NUM_BONES + self.pairs[items.pairs])[items.is_wanted]
         parts = self.fusion.over_pairs(logits, slots, len(points) * NUM_BONES, slope=self.sharpness)
@@ -383,15 +393,11 @@ class PairOccupancy(nn.Module):
         answers = last.of_set(tokens[is_wanted][:, None], tokens.amax(-2)[item])[:, 0]
         return LOGIT_SCALE * self.decoder.mlp(self.decoder.pointnet.output(answers.relu()))[:, 0]
 
-    def _chunk_occupancy(
-        self, codes: HandCodes, points: Float[Tensor, "points 3"], kernel: Kernel
-    ) -> Occupancy:
+    def _chunk_occupancy(self, codes: HandCodes, points: Float[Tensor, "points 3"]) -> Occupancy:
         """The fast evaluation: the same function as :meth:`plain`, by exact algebra.
 
         Only pairs with a box that holds the point are decoded.
         """
-        if kernel != "torch" and isinstance(self.fusion, MaximumFusion):
-            return self._fused_occupancy(codes, points, PRECISIONS[kernel])
         num_points = len(points)
         local = local_points(codes.boxes, points)
         is_in_box = contains(codes.boxes, local)
@@ -430,29 +436,66 @@ class PairOccupancy(nn.Module):
         features, row_of = self._part_features(codes, local, is_needed)
         return self._answers(features[row_of[members, items.points[:, None]]], items.is_wanted)
 
-    def _largest_logits(
-        self, codes: HandCodes, points: Float[Tensor, "points 3"], items: PairItems
-    ) -> Float[Tensor, "points"]:
-        """The largest logit of each point's items, by :mod:`handavatar.field.fused`."""
-        from handavatar.field.fused import largest_logits
-
-        weights, hand = self._packed_for(codes, PRECISIONS["triton"])
-        return largest_logits(weights, hand, points, items.points, items.pairs, items.is_wanted)
-
     def _fused_occupancy(
-        self, codes: HandCodes, points: Float[Tensor, "points 3"], precision: Precision
+        self, codes: HandCodes, points: Float[Tensor, "points 3"], kernel: Kernel
     ) -> Occupancy:
         """:meth:`_chunk_occupancy` with maximum fusion, all of it in kernels."""
-        from handavatar.field.fused import fused_occupancy
+        decided = self.nothing_decided(codes, len(points))
+        self.decide(codes, points, kernel, decided, torch.arange(len(points), device=points.device))
+        where = (decided.deciders >= 0).nonzero()[:, 0]
+        return Occupancy(decided.whole, decided.soft, decided_items(where, decided.deciders[where]))
 
-        weights, hand = self._packed_for(codes, precision)
-        whole, soft, deciders = fused_occupancy(
-            weights, hand, points, self.softness, self.sharpness
-        )
-        decided = (deciders >= 0).nonzero()[:, 0]
-        decider = deciders[decided].long()
-        is_wanted = torch.nn.functional.one_hot(decider % 2, 2).bool()
-        return Occupancy(whole, soft, PairItems(decided, decider // 2, is_wanted))
+    def nothing_decided(self, codes: HandCodes, count: int) -> "Decided":
+        """What :meth:`decide` fills in: no hand at so many places."""
+        from handavatar.field.fused import Decided
+
+        return Decided.nothing(count, NUM_BONES, codes.part_codes.device)
+
+    def decide(
+        self,
+        codes: HandCodes,
+        points: Float[Tensor, "points 3"],
+        kernel: Kernel,
+        decided: "Decided",
+        places: Int[Tensor, "points"],
+    ) -> None:
+        """Evaluates :meth:`forward` in kernels and notes the answers, without gradient.
+
+        Args:
+            codes: of the posed hand.
+            points: world, metres; what is not a number is nowhere near the hand.
+            kernel: one of Triton's; see :meth:`is_fused`.
+            decided: takes the answers.
+            places: where it takes them.
+        """
+        from handavatar.field.fused import decide
+
+        at_once = 1024 * self.chunk
+        weights, hand = self._packed_for(codes, PRECISIONS[kernel])
+        for part, where in zip(points.split(at_once), places.split(at_once), strict=True):
+            decide(weights, hand, part, self.softness, self.sharpness, decided, where)
+
+    def whole_again(
+        self,
+        codes: HandCodes,
+        points: Float[Tensor, "points 3"],
+        deciders: Int[Tensor, "points"],
+    ) -> Float[Tensor, "points"]:
+        """Occupancy from the answers that decide, with long factors in kernels; without gradient.
+
+        Args:
+            codes: of the posed hand.
+            points: world, metres.
+            deciders: what :meth:`decide` has found there.
+        """
+        from handavatar.field.fused import decided_logits
+
+        weights, hand = self._packed_for(codes, PRECISIONS["triton"])
+        return soft_occupancy(decided_logits(weights, hand, points, deciders), self.sharpness)
+
+    def is_fused(self, kernel: Kernel) -> bool:
+        """Whether the field runs in Triton's kernels; ``kernel`` is not ``auto``."""
+        return kernel != "torch" and isinstance(self.fusion, MaximumFusion)
 
     def _packed_for(
         self, codes: HandCodes, precision: Precision
@@ -467,10 +510,10 @@ class PairOccupancy(nn.Module):
             self._packed[precision] = state, packed
         weights = self._packed[precision][1]
         known = self._hands.get(codes)
-        if known is None or known[0] is not weights:
+        if known is None or known[0] != state:
             hand = pack_hand(weights, codes.part_codes, codes.boxes, self.pairs)
-            known = self._hands[codes] = weights, hand
-        return known
+            known = self._hands[codes] = state, hand
+        return weights, known[1]
 
     def _part_features(
         self,
