@@ -50,7 +50,7 @@ def test_a_replayed_state_is_the_prepared_one(small_avatar: HandAvatar) -> None:
             (replayed.codes.boxes.upper, computed.codes.boxes.upper),
             (replayed.anchor_normals, computed.anchor_normals),
         ]
-        return max(float((found - true).abs().max()) for found, true in pairs)
+        return max(float((found - true).detach().abs().max()) for found, true in pairs)
 
     poses = [bent_pose(step).to("cuda") for step in (3, 5)]
     with torch.no_grad():

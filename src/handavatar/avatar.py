@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -322,7 +323,15 @@ class HandAvatar(nn.Module):
                 self._unlit_state,
                 (pose.rotations, pose.translation),
                 _copied_state,
-                (self.rig, self.parts, *self.parameters(), *self.buffers()),
+                (
+                    self.rig,
+                    self.parts,
+                    self.coefficients,
+                    self.anchor_corners,
+                    self.anchor_barycentric,
+                    *self.shape.parameters(),
+                    *self.occupancy.encoder.parameters(),
+                ),
                 (self.occupancy.margin,),
             )
         else:
@@ -898,6 +907,7 @@ def _steps(settings: RenderSettings, depths: Float[Tensor, "rays samples"]) -> t
     return settings.coarse, settings.group
 
 
+@cache
 def _looked_at(num_samples: int, stride: int, device: torch.device) -> Int[Tensor, "coarse"]:
     """Every so many samples, and the last."""
     return torch.tensor(sorted({*range(0, num_samples, stride), num_samples - 1}), device=device)

@@ -1,6 +1,7 @@
 """The Triton kernels of rays and coverage against torch's; run by ``test_fused_rays.py``."""
 
 import math
+from itertools import pairwise
 
 import pytest
 import torch
@@ -49,8 +50,7 @@ def test_rays_meet_the_same_boxes() -> None:
     found_near, found_far = box_intervals(rays, transforms, -upper, upper)
     assert 5 < int(is_hit.sum()) < NUM_RAYS - 5
     assert torch.equal(found_near < found_far, is_hit)
-    torch.testing.assert_close(found_near[is_hit], near[is_hit], atol=1e-5, rtol=1e-5)
-    torch.testing.assert_close(found_far[is_hit], far[is_hit], atol=1e-5, rtol=1e-5)
+    assert torch.equal(found_near, near) and torch.equal(found_far, far)
 
 
 def test_samples_of_dark_rays_are_nowhere() -> None:
@@ -83,7 +83,7 @@ def test_samples_are_found_between() -> None:
     looked_at = torch.tensor(LOOKED_AT, device=DEVICE)
     expected = []
     for ray in range(NUM_RAYS):
-        for here, following in zip(LOOKED_AT, LOOKED_AT[1:], strict=False):
+        for here, following in pairwise(LOOKED_AT):
             light = math.prod(
                 float(1 - occupancy[ray, place]) for place in LOOKED_AT if place <= here
             )

@@ -519,8 +519,10 @@ def decide(
     )  # fmt: skip
     ends = counts.flatten().cumsum(0)
     pair_ends = ends[count - 1 :: count]
-    found = pair_ends.tolist()
+    item_ends = (pair_ends >> 32).int()
     best, winners = _nobody(points, len(hand.transforms))
+    # All that can be asked of the GPU before its answer is waited for is asked above.
+    found = pair_ends.tolist()
     if found[-1]:
         num_items, num_answers = found[-1] >> 32, found[-1] & 0xFFFFFFFF
         item_points, item_pairs = held_by.new_empty(2, num_items)
@@ -529,9 +531,9 @@ def decide(
             held_by, ends, counts, hand.pairs, item_points, item_pairs, answers, count,
             BLOCK=_POINTS,
         )  # fmt: skip
-        items = _Items(item_points, item_pairs, answers, (pair_ends >> 32).int())
-        item_ends = pairwise([0, *(end >> 32 for end in found)])
-        tiles = sum(triton.cdiv(end - begin, _BLOCK) for begin, end in item_ends)
+        items = _Items(item_points, item_pairs, answers, item_ends)
+        ranges = pairwise([0, *(end >> 32 for end in found)])
+        tiles = sum(triton.cdiv(end - begin, _BLOCK) for begin, end in ranges)
         _decode(weights, hand, points, items, tiles, best, winners)
     _values[(blocks,)](
         points, hand.transforms, hand.boxes, best, winners, places, decided.whole, decided.soft,

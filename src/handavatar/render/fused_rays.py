@@ -22,34 +22,25 @@ _ROWS = 32
 """At a time in one program that holds a number for every bone of each."""
 
 
-@triton.jit
-def _turned(row, x, y, z):
-    return tl.load(row) * x + tl.load(row + 1) * y + tl.load(row + 2) * z
-
-
 @triton.jit(do_not_specialize=["count"])
 def _intervals(
-    origins, directions, transforms, lower, upper, near, far, count,
+    origins, directions, shifts, lower, upper, near, far, count,
     BOXES: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     ray = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     is_ray = ray < count
-    place, along = origins + 3 * ray, directions + 3 * ray
-    x, y = tl.load(place, mask=is_ray, other=0.0), tl.load(place + 1, mask=is_ray, other=0.0)
-    z = tl.load(place + 2, mask=is_ray, other=0.0)
-    u, v = tl.load(along, mask=is_ray, other=1.0), tl.load(along + 1, mask=is_ray, other=1.0)
-    w = tl.load(along + 2, mask=is_ray, other=1.0)
     nearest = tl.full((BLOCK,), float("inf"), tl.float32)
     furthest = -nearest
     for box in tl.static_range(BOXES):
         enter, leave = tl.zeros((BLOCK,), tl.float32), tl.full((BLOCK,), float("inf"), tl.float32)
         for axis in tl.static_range(3):
-            row = transforms + 12 * box + 4 * axis
-            origin = _turned(row, x, y, z) + tl.load(row + 3)
-            slope = _turned(row, u, v, w)
+            place = 3 * (box * count.to(tl.int64) + ray) + axis
+            origin = tl.load(origins + place, mask=is_ray, other=0.0)
+            origin += tl.load(shifts + 3 * box + axis)
+            slope = tl.load(directions + place, mask=is_ray, other=1.0)
             slope = tl.where(tl.abs(slope) < 1e-12, 1e-12, slope)
-            first = (tl.load(lower + 3 * box + axis) - origin) / slope
-            second = (tl.load(upper + 3 * box + axis) - origin) / slope
+            first = tl.div_rn(tl.load(lower + 3 * box + axis) - origin, slope)
+            second = tl.div_rn(tl.load(upper + 3 * box + axis) - origin, slope)
             enter = tl.maximum(enter, tl.minimum(first, second))
             leave = tl.minimum(leave, tl.maximum(first, second))
         is_hit = enter < leave
@@ -152,7 +143,9 @@ def box_intervals(
     lower: Float[Tensor, "boxes 3"],
     upper: Float[Tensor, "boxes 3"],
 ) -> tuple[Float[Tensor, "rays"], Float[Tensor, "rays"]]:
-    """Near and far of :func:`handavatar.render.sampling.intervals_through_boxes`.
+    """Near and far of :func:`handavatar.render.sampling.intervals_through_boxes`, to the last bit.
+
+    Where a ray grazes a box, the last bit decides from where to where it is sampled.
 
     Returns:
         Where each ray enters the first box and leaves the last one; infinity and minus infinity
@@ -161,10 +154,13 @@ def box_intervals(
     near = rays.origins.new_empty(len(rays.origins))
     far = torch.empty_like(near)
     if len(near):
+        rotation = box_from_world[:, :3, :3]
+        origins = torch.einsum("bij,rj->rbi", rotation, rays.origins)
+        directions = torch.einsum("bij,rj->rbi", rotation, rays.directions)
         _intervals[(triton.cdiv(len(near), _RAYS),)](
-            rays.origins.contiguous(), rays.directions.contiguous(),
-            box_from_world[:, :3].contiguous(), lower.contiguous(), upper.contiguous(), near, far,
-            len(near), BOXES=len(lower), BLOCK=_RAYS,
+            origins.transpose(0, 1).contiguous(), directions.transpose(0, 1).contiguous(),
+            box_from_world[:, :3, 3].contiguous(), lower.contiguous(), upper.contiguous(), near,
+            far, len(near), BOXES=len(lower), BLOCK=_RAYS,
         )  # fmt: skip
     return near, far
 
