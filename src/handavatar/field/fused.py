@@ -467,8 +467,6 @@ class Decided:
         soft: of each part, softly.
         deciders: twice the number of the pair that decides, plus one if it is its second part; -1
             where there is none.
-
-    Source: paper Sec. 3.2, Eq. 1, and Sec. 3.3, Eq. 3.
     """
 
     whole: Float[Tensor, "places"]
@@ -504,6 +502,8 @@ def decide(
         sharpness: what the logit of the whole is multiplied by.
         decided: takes the answers.
         places: where it takes them.
+
+    Source: paper Sec. 3.2, Eq. 1, and Sec. 3.3, Eq. 3.
     """
     points = points.detach().contiguous()
     count, num_pairs = len(points), len(hand.pairs)
