@@ -113,8 +113,9 @@ class RenderSettings:
         edge_rays: at the hand's outline a pixel is the mean of so many rays in both directions; a
             single one says all or nothing of a pixel that the hand covers in part.
         rays_at_once: bounds the memory; a GPU takes 32 times as many.
-        kernel: what decodes pairs of parts; see :func:`handavatar.field.kernels.chosen_kernel`.
-            With shorter factors, samples that can be seen are evaluated once more with 32 bits.
+        kernel: torch's operations or Triton's kernels for rays and occupancy; see
+            :func:`handavatar.field.kernels.chosen_kernel`. With shorter factors, samples that can
+            be seen are evaluated once more with long ones.
     """
 
     num_samples: int = 64

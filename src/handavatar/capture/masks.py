@@ -9,6 +9,7 @@ the forearm as well; where the hand ends is decided by the fitted rig.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -300,8 +301,8 @@ def settled_border(
     pixels = image.astype(np.float32) @ _LUMA_AND_COLOR.T
     level = mask.astype(np.float32)
     for _ in range(_BORDER_ROUNDS):
-        depth = ndimage.distance_transform_edt(mask)
-        height = ndimage.distance_transform_edt(~mask)
+        depth = _depth(mask)
+        height = _depth(~mask)
         skin = _local_mean(pixels, depth > _BORDER_GAP)
         beside = _local_mean(pixels, height > _BORDER_GAP)
         apart = skin - beside
@@ -310,8 +311,9 @@ def settled_border(
         is_free = (depth <= _BORDER_REACH) & (height <= _BORDER_REACH) & ~is_background
         trust = np.where(is_free, contrast / (contrast + _BORDER_NOISE**2), 1.0)
         value = trust * np.where(is_free, share, mask) + _BORDER_INERTIA * mask
-        smooth = ndimage.gaussian_filter(value, _BORDER_SMOOTHING)
-        smooth /= ndimage.gaussian_filter(trust + _BORDER_INERTIA, _BORDER_SMOOTHING)
+        weighed = np.stack([value, trust + _BORDER_INERTIA], axis=-1)
+        smooth, weight = np.moveaxis(_blurred(weighed, _BORDER_SMOOTHING), -1, 0)
+        smooth = smooth / weight
         level = np.where(is_free, smooth, mask).clip(0, 1)
         mask = level > 0.5
     return level
@@ -321,12 +323,39 @@ def _local_mean(
     values: Float[np.ndarray, "side side 3"], is_used: Bool[np.ndarray, "side side"]
 ) -> Float[np.ndarray, "side side 3"]:
     """Mean over the used pixels around each pixel; over a wider circle where none is near."""
-    total, weight = np.zeros_like(values), np.zeros(is_used.shape, dtype=values.dtype)
-    for sigma, share in ((_BORDER_CIRCLE, 1.0), (3 * _BORDER_CIRCLE, 1e-3)):
-        weights = is_used.astype(values.dtype)
-        weight += share * ndimage.gaussian_filter(weights, sigma)
-        total += share * ndimage.gaussian_filter(weights[..., None] * values, (sigma, sigma, 0))
-    return total / (weight[..., None] + 1e-12)
+    weighed = np.where(is_used[..., None], np.insert(values, 3, 1.0, axis=-1), 0.0)
+    weighed = weighed.astype(np.float32)
+    total = _blurred(weighed, _BORDER_CIRCLE) + 1e-3 * _blurred(weighed, 3 * _BORDER_CIRCLE)
+    return total[..., :3] / (total[..., 3:] + 1e-12)
+
+
+def _blurred(
+    values: Float[np.ndarray, "side side channels"], sigma: float
+) -> Float[np.ndarray, "side side channels"]:
+    """Under a Gaussian that ends after four standard deviations; mirrored at the border."""
+    cv2 = _opencv()
+    return cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
+
+
+def _depth(mask: Bool[np.ndarray, "side side"]) -> Float[np.ndarray, "side side"]:
+    """Distance of each pixel of the mask from the nearest one that is not of it, pixels."""
+    cv2 = _opencv()
+    return cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+
+
+def _opencv() -> Any:
+    """The package.
+
+    Raises:
+        CaptureError: if it is not installed.
+    """
+    try:
+        import cv2
+    except ImportError as error:
+        raise CaptureError(
+            f"OpenCV cannot be loaded ({error})", "pip install 'handavatar[video]'"
+        ) from error
+    return cv2
 
 
 # GrabCut's labels.
@@ -336,12 +365,7 @@ _BACKGROUND, _HAND, _LIKELY_BACKGROUND, _LIKELY_HAND = 0, 1, 2, 3
 def _graph_cut(
     image: UInt8[np.ndarray, "side side 3"], labels: UInt8[np.ndarray, "side side"]
 ) -> Bool[np.ndarray, "side side"]:
-    try:
-        import cv2
-    except ImportError as error:
-        raise CaptureError(
-            f"OpenCV cannot be loaded ({error})", "pip install 'handavatar[video]'"
-        ) from error
+    cv2 = _opencv()
     if not (labels & 1).any() or (labels & 1).all():
         return (labels & 1).astype(bool)
     labels = labels.copy()
@@ -376,7 +400,7 @@ def _within(mask: Bool[np.ndarray, "side side"], radius: float) -> Bool[np.ndarr
     """All pixels at most ``radius`` pixels from the mask."""
     if not mask.any():
         return mask
-    return ndimage.distance_transform_edt(~mask) <= radius
+    return _depth(~mask) <= radius
 
 
 def _sure_and_spread(hands: Sequence[TrackedHand], count: int) -> list[TrackedHand]:
@@ -396,7 +420,7 @@ def _regions(hand: TrackedHand) -> _Regions:
     inner_palm = ~_within(~palm, 0.008 * scale)
     forearm = _forearm(points, side)
     covered = bones | palm
-    distance = ndimage.distance_transform_edt(~covered)
+    distance = _depth(~covered)
     return _Regions(
         core=bones | inner_palm,
         near=distance < _HAND_RADIUS * scale,

@@ -15,7 +15,7 @@ from handavatar.capture.windows import Window
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.hand.rig import Rig
-from handavatar.render.rasterize import rasterize
+from handavatar.render.rasterize import covered_pixels
 
 _MAX_FROM_MASK = 128
 _MAX_TO_MASK = 128
@@ -195,5 +195,4 @@ def silhouette(
     rig: Rig, vertices: Float[Tensor, "vertices 3"], camera: Camera
 ) -> Bool[np.ndarray, "height width"]:
     """Which pixels the hand covers, its wrist closed."""
-    fragments = rasterize(rig.sealed(vertices), rig.sealed_faces, camera)
-    return fragments.mask.numpy()
+    return covered_pixels(rig.sealed(vertices), rig.sealed_faces, camera).numpy()

@@ -208,12 +208,20 @@ def _fitted(
     model = HandModel(rig)
     vertices = model.all_vertices(fit)
     errors = landmark_errors(model, observations, fit)
-    results = []
-    for number, (hand, mask) in enumerate(zip(track.hands, masks, strict=True)):
+
+    def cropped(number: int) -> FittedFrame:
+        hand, mask = track.hands[number], masks[number]
         error_metres = float(errors[number] / observations.scale[number])
-        result = _result(hand, mask, rig, fit, number, vertices[number], error_metres, options.size)
-        results.append(result)
-        report(0.85 + 0.1 * number / len(masks), "cropping")
+        return _result(hand, mask, rig, fit, number, vertices[number], error_metres, options.size)
+
+    results: list[FittedFrame] = []
+    # Torch's number of threads belongs to a thread.
+    with ThreadPoolExecutor(
+        os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)
+    ) as pool:
+        for result in pool.map(cropped, range(len(masks))):
+            results.append(result)
+            report(0.85 + 0.1 * len(results) / len(masks), "cropping")
     return fit, results
 
 

@@ -1,7 +1,8 @@
 """The occupancy field in Triton kernels, for NVIDIA GPUs.
 
-Optional: Triton comes with torch's CUDA builds and is imported here and in
-:mod:`handavatar.field.fused_anchors` alone. The kernels compute what
+Optional: Triton comes with torch's CUDA builds and is imported here, in
+:mod:`handavatar.field.fused_anchors`, :mod:`handavatar.render.fused_rays` and
+:mod:`handavatar.render.fused_coverage` alone. The kernels compute what
 ``PairOccupancy._chunk_occupancy`` computes with torch's operations, without gradient. *Boxes* finds
 the part boxes that hold a point and *listed* what is to be decoded, pair by pair, so that a program
 reads the codes of two parts only. Of the decoder, a *trunk* runs for every point of a pair, up to
