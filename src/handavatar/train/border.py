@@ -37,9 +37,6 @@ class _Border:
     coverage: Float[Tensor, "rays"]
 
 
-_Piece = tuple[HandCodes, Rays, Float[Tensor, "rays"], torch.Generator]
-
-
 def fit_border(
     avatar: HandAvatar, frames: list[Frame], steps: int, settings: RenderSettings, seed: int
 ) -> None:
@@ -58,25 +55,19 @@ def fit_border(
     generator = torch.Generator().manual_seed(seed)
     borders = _borders(avatar, frames if steps else [])
 
-    def pieces_of_step() -> list[_Piece]:
-        numbers = torch.randint(len(borders), (_FRAMES,), generator=generator).tolist()
-        return [_piece(borders[number], generator) for number in numbers]
-
-    def loss_of_piece(piece: _Piece) -> Float[Tensor, ""]:
-        codes, rays, coverage, own_generator = piece
-        return border_loss(avatar.alpha(codes, rays, settings, own_generator), coverage)
+    def loss_of_step() -> Float[Tensor, ""]:
+        losses = []
+        for number in torch.randint(len(borders), (_FRAMES,), generator=generator).tolist():
+            border = borders[number]
+            some = torch.randint(len(border.coverage), (_PIXELS,), generator=generator)
+            some = some.to(avatar.device)
+            rays = Rays(border.rays.origins[some], border.rays.directions[some])
+            alpha = avatar.alpha(border.codes, rays, settings, generator)
+            losses.append(border_loss(alpha, border.coverage[some]))
+        return torch.stack(losses).mean()
 
     decoder, steps = avatar.occupancy.decoder, steps if borders else 0
-    descend("border", decoder, steps, (_RATE, _LAST_RATE), loss_of_piece, pieces_of_step)
-
-
-def _piece(border: _Border, generator: torch.Generator) -> _Piece:
-    """Some rays of a frame, and where their samples' jitter comes from."""
-    some = torch.randint(len(border.coverage), (_PIXELS,), generator=generator)
-    seed = int(torch.randint(1 << 62, (), generator=generator))
-    some = some.to(border.coverage.device)
-    rays = Rays(border.rays.origins[some], border.rays.directions[some])
-    return border.codes, rays, border.coverage[some], torch.Generator().manual_seed(seed)
+    descend("border", decoder, steps, (_RATE, _LAST_RATE), loss_of_step)
 
 
 def _borders(avatar: HandAvatar, frames: list[Frame]) -> list[_Border]:

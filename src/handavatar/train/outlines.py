@@ -21,7 +21,6 @@ from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, Rig
 from handavatar.render.silhouette import silhouette_loss, soft_mask, soft_silhouette
 from handavatar.train.corrections import PoseCorrections
-from handavatar.train.gradients import set_mean_gradient
 from handavatar.train.losses import offset_loss
 from handavatar.train.progress import Progress
 
@@ -171,15 +170,21 @@ def _shape_step(
     chosen: list[int],
 ) -> float:
     """Sets the gradient of the shape to that of some frames; returns their silhouette loss."""
+    parameters = list(avatar.shape.parameters())
 
-    def loss_of(number: int) -> tuple[Tensor, float]:
+    def differentiated(number: int) -> tuple[tuple[Tensor, ...], float]:
         frame = frames[number]
         pose = corrected_pose(corrections, frame, number, avatar.device)
         camera, mask = frame.camera.to(avatar.device), masks[number].to(avatar.device)
-        rest = avatar.coarse_rig.shaped(avatar.coefficients)
-        offsets = avatar.shape(rest, pose.rotations)
-        posed = personal_hand(rest, offsets).posed(pose)
-        losses = shape_losses(posed, offsets, camera, mask, edges)
-        return torch.stack(list(losses.values())).sum(), float(losses["silhouette"].detach())
+        with torch.enable_grad():
+            rest = avatar.coarse_rig.shaped(avatar.coefficients)
+            offsets = avatar.shape(rest, pose.rotations)
+            posed = personal_hand(rest, offsets).posed(pose)
+            losses = shape_losses(posed, offsets, camera, mask, edges)
+            gradient = torch.autograd.grad(torch.stack(list(losses.values())).sum(), parameters)
+        return gradient, float(losses["silhouette"].detach())
 
-    return set_mean_gradient(list(avatar.shape.parameters()), loss_of, chosen)
+    gradients, values = zip(*mapped(differentiated, chosen), strict=True)
+    for parameter, parts in zip(parameters, zip(*gradients, strict=True), strict=True):
+        parameter.grad = torch.stack(parts).mean(0)
+    return sum(values) / len(values)

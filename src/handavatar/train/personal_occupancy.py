@@ -8,7 +8,7 @@ known, tell it more for the same time than rays do.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar
@@ -57,19 +57,15 @@ def fit_occupancy(avatar: HandAvatar, poses: list[HandPose], steps: int, seed: i
     # Hands and labels cost as much as a step: once for all steps, one of every pose.
     hands = _known_hands(avatar, poses if steps else [], seed)
 
-    def pieces_of_step() -> list[tuple[_KnownHand, Int[Tensor, "some"]]]:
-        numbers = torch.randint(len(hands), (_HANDS,), generator=generator).tolist()
-        return [
-            (hands[number], torch.randint(_POOL, (_POINTS,), generator=generator))
-            for number in numbers
-        ]
+    def loss_of_step() -> Float[Tensor, ""]:
+        losses = []
+        for number in torch.randint(len(hands), (_HANDS,), generator=generator).tolist():
+            hand = hands[number]
+            some = torch.randint(_POOL, (_POINTS,), generator=generator).to(avatar.device)
+            losses.append(loss_of.of_codes(hand.codes, hand.points[some], hand.is_inside[some]))
+        return torch.stack(losses).mean()
 
-    def loss_of_piece(piece: tuple[_KnownHand, Int[Tensor, "some"]]) -> Float[Tensor, ""]:
-        hand, some = piece[0], piece[1].to(avatar.device)
-        return loss_of.of_codes(hand.codes, hand.points[some], hand.is_inside[some])
-
-    decoder, rates = avatar.occupancy.decoder, (_RATE, _LAST_RATE)
-    descend("occupancy", decoder, steps, rates, loss_of_piece, pieces_of_step)
+    descend("occupancy", avatar.occupancy.decoder, steps, (_RATE, _LAST_RATE), loss_of_step)
 
 
 def _known_hands(avatar: HandAvatar, poses: list[HandPose], seed: int) -> list[_KnownHand]:

@@ -4,7 +4,6 @@ import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -21,7 +20,6 @@ from handavatar.field.occupancy import (
 )
 from handavatar.hand.parts import Parts
 from handavatar.hand.rig import PosedHand
-from handavatar.train.gradients import set_mean_gradient
 from handavatar.train.labelled_poses import LabelledPose
 from handavatar.train.muon import Muon
 from handavatar.train.optimizer_state import (
@@ -39,8 +37,6 @@ from handavatar.train.runs import (
     write_json,
 )
 from handavatar.train.stage_times import StageTimes
-
-Piece = TypeVar("Piece")
 
 LEAST_ERROR = 0.02
 """A point whose occupancy is this close to its label has hardly a gradient, and is left out."""
@@ -181,32 +177,29 @@ def descend(
     decoder: nn.Module,
     steps: int,
     rates: tuple[float, float],
-    loss_of: Callable[[Piece], Float[Tensor, ""]],
-    pieces_of_step: Callable[[], Sequence[Piece]],
+    loss_of_step: Callable[[], Float[Tensor, ""]],
 ) -> None:
     """Trains a decoder alone, in one go, with the prior's optimisers.
 
     Args:
         title: of the progress.
-        decoder: what is trained.
+        decoder: whose gradients ``loss_of_step`` gives.
         steps: how many.
         rates: highest and last learning rate; see :func:`learning_rate`.
-        loss_of: the loss of a piece of a step; pieces run side by side.
-        pieces_of_step: draws those of the next step.
+        loss_of_step: the loss of the next step, on samples of its own.
     """
-
-    def told_loss(piece: Piece) -> tuple[Tensor, float]:
-        loss = loss_of(piece)
-        return loss, float(loss.detach())
-
-    optimizers, parameters = prior_optimizers(decoder), list(decoder.parameters())
+    optimizers = prior_optimizers(decoder)
     average = math.nan
     with Progress(title, steps) as progress:
         for step in range(1, steps + 1):
             set_rate(optimizers, learning_rate(step, steps, *rates))
-            value = set_mean_gradient(parameters, told_loss, pieces_of_step())
+            for optimizer in optimizers.values():
+                optimizer.zero_grad(set_to_none=True)
+            loss = loss_of_step()
+            loss.backward()
             for optimizer in optimizers.values():
                 optimizer.step()
+            value = float(loss.detach())
             average = value if math.isnan(average) else 0.95 * average + 0.05 * value
             progress.update(step, loss=average)
     decoder.zero_grad(set_to_none=True)
