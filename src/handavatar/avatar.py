@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from handavatar.edit import Edit, Paint
 from handavatar.field.anchors import Neighbours, nearest_anchors, place_anchors
-from handavatar.field.kernels import SHORTER, Kernel, chosen_kernel
+from handavatar.field.kernels import SHORTER, Kernel, settled_kernel
 from handavatar.field.occupancy import HandCodes, PairItems, PairOccupancy, decided_items
 from handavatar.field.shading import (
     AlbedoField,
@@ -173,6 +173,22 @@ class VisibleSamples:
     depths: Float[Tensor, "kept"]
     directed: Float[Tensor, "kept bones"]
     neighbours: Neighbours
+
+
+@dataclass(frozen=True, eq=False)
+class _Weighed:
+    """:class:`VisibleSamples` before their anchors are looked for; ``points`` are in the world."""
+
+    weights: Float[Tensor, "kept"]
+    rays: Int[Tensor, "kept"]
+    depths: Float[Tensor, "kept"]
+    points: Float[Tensor, "kept 3"]
+    directed: Float[Tensor, "kept bones"]
+
+
+_Found = tuple[
+    Int[Tensor, "kept"], Float[Tensor, "kept 3"], Float[Tensor, "kept"], Float[Tensor, "kept bones"]
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -439,13 +455,9 @@ class HandAvatar(nn.Module):
         generator: torch.Generator | None = None,
     ) -> VisibleSamples:
         """The samples that weigh something in their ray; see :meth:`render_rays`."""
-        settings = replace(settings, kernel=_kernel(settings.kernel, self.device))
-        hit, rays_hit, depths = _sampled(state.codes, rays, settings, generator)
-        weights, kept, directed = self._weighed(state.codes, rays_hit, depths, settings)
-        ray, sample = kept.unbind(-1)
-        points = _places(rays_hit, depths, kept)
-        neighbours = nearest_anchors(state.anchors, points, kernel=settings.kernel)
-        return VisibleSamples(weights, hit[ray], depths[ray, sample], directed, neighbours)
+        found = self._weighed(state.codes, rays, settings, generator)
+        neighbours = nearest_anchors(state.anchors, found.points, kernel=settings.kernel)
+        return VisibleSamples(found.weights, found.rays, found.depths, found.directed, neighbours)
 
     def alpha(
         self,
@@ -455,33 +467,46 @@ class HandAvatar(nn.Module):
         generator: torch.Generator | None = None,
     ) -> Float[Tensor, "rays"]:
         """The alpha of :meth:`render_rays` alone, with the same gradient: nothing is shaded."""
-        settings = replace(settings, kernel=_kernel(settings.kernel, self.device))
-        hit, rays_hit, depths = _sampled(codes, rays, settings, generator)
-        weights, kept, _ = self._weighed(codes, rays_hit, depths, settings)
-        return weights.new_zeros(len(rays.origins)).index_add(0, hit[kept[:, 0]], weights)
+        found = self._weighed(codes, rays, settings, generator)
+        return found.weights.new_zeros(len(rays.origins)).index_add(0, found.rays, found.weights)
 
     def _weighed(
         self,
         codes: HandCodes,
         rays: Rays,
+        settings: RenderSettings,
+        generator: torch.Generator | None,
+    ) -> _Weighed:
+        """The samples that weigh something in their ray, and what lies before them."""
+        settings = replace(settings, kernel=settled_kernel(settings.kernel, self.device))
+        hit, rays, depths = _sampled(codes, rays, settings, generator)
+        is_fused = self.occupancy.is_fused(settings.kernel)
+        weigh = self._weighed_fused if is_fused else self._weighed_plain
+        samples, points, weights, directed = weigh(codes, rays, depths, settings)
+        ray = hit[samples // depths.shape[1]]
+        return _Weighed(weights, ray, depths.flatten()[samples], points, directed)
+
+    def _weighed_plain(
+        self,
+        codes: HandCodes,
+        rays: Rays,
         depths: Float[Tensor, "rays samples"],
         settings: RenderSettings,
-    ) -> tuple[Float[Tensor, "kept"], Int[Tensor, "kept 2"], Float[Tensor, "kept bones"]]:
-        """Weights of the samples that can be seen, which they are, and what lies before them."""
-        if self.occupancy.is_fused(settings.kernel):
-            return self._weighed_fused(codes, rays, depths, settings)
+    ) -> _Found:
+        """Numbers, places and weights of the samples, and what lies before them."""
         occupancy, soft, items = self._march(codes, rays, depths, settings)
         is_kept = visibility(occupancy) > settings.smallest_weight
-        kept = is_kept.nonzero()
+        samples = is_kept.flatten().nonzero()[:, 0]
+        points = _places(rays, depths, samples)
         if torch.is_grad_enabled():
             position = torch.full((depths.numel(),), -1, device=depths.device)
-            position[is_kept.flatten()] = torch.arange(len(kept), device=depths.device)
+            position[samples] = torch.arange(len(samples), device=depths.device)
             item_position = position[items.points]
             is_used = item_position >= 0
             used = PairItems(item_position[is_used], items.pairs[is_used], items.is_wanted[is_used])
-            again = self.occupancy.of_items(codes, _places(rays, depths, kept), used)
-            occupancy = occupancy.index_put(kept.unbind(-1), again)
-        return visibility(occupancy)[is_kept], kept, directed_occupancy(soft)[is_kept]
+            again = self.occupancy.of_items(codes, points, used)
+            occupancy = _replaced(occupancy, samples, again)
+        return samples, points, visibility(occupancy)[is_kept], directed_occupancy(soft)[is_kept]
 
     def _weighed_fused(
         self,
@@ -489,28 +514,24 @@ class HandAvatar(nn.Module):
         rays: Rays,
         depths: Float[Tensor, "rays samples"],
         settings: RenderSettings,
-    ) -> tuple[Float[Tensor, "kept"], Int[Tensor, "kept 2"], Float[Tensor, "kept bones"]]:
-        """:meth:`_weighed` by kernels. What shorter factors have only found is evaluated again."""
+    ) -> _Found:
+        """The same by kernels. What shorter factors have only found is evaluated again."""
         from handavatar.render.fused_rays import largest_met, sample_weights
 
         decided = self._march_fused(codes, rays, depths, settings)
         occupancy = decided.whole.view_as(depths)
         weights = sample_weights(occupancy)
         samples = (weights.flatten() > settings.smallest_weight).nonzero()[:, 0]
-        ray = samples // depths.shape[1]
-        kept = torch.stack([ray, samples - ray * depths.shape[1]], dim=-1)
-        directed = largest_met(decided.soft.view(*depths.shape, -1), samples)
-        if not torch.is_grad_enabled() and settings.kernel not in SHORTER:
-            return weights.flatten()[samples], kept, directed
-        points, deciders = _places(rays, depths, kept), decided.deciders[samples]
+        points, deciders = _places(rays, depths, samples), decided.deciders[samples]
         if torch.is_grad_enabled():
-            items = decided_items(torch.arange(len(kept), device=depths.device), deciders)
+            items = decided_items(torch.arange(len(samples), device=depths.device), deciders)
             again = self.occupancy.of_items(codes, points, items)
-            weights = visibility(occupancy.index_put(kept.unbind(-1), again))
-        else:
+            weights = visibility(_replaced(occupancy, samples, again))
+        elif settings.kernel in SHORTER:
             again = self.occupancy.whole_again(codes, points, deciders)
-            weights = sample_weights(decided.whole.index_copy_(0, samples, again).view_as(depths))
-        return weights.flatten()[samples], kept, directed
+            weights = sample_weights(_replaced(occupancy, samples, again))
+        directed = largest_met(decided.soft.view(*depths.shape, -1), samples)
+        return samples, points, weights.flatten()[samples], directed
 
     @torch.no_grad()
     def _march_fused(
@@ -565,9 +586,7 @@ class HandAvatar(nn.Module):
         found: list[PairItems] = []
 
         def evaluate(flat: Int[Tensor, "samples"]) -> None:
-            ray = flat // num_samples
-            points = rays.origins[ray] + depths.view(-1)[flat][:, None] * rays.directions[ray]
-            result = self.occupancy(codes, points, "torch")
+            result = self.occupancy(codes, _places(rays, depths, flat), "torch")
             occupancy.view(-1)[flat] = result.whole
             soft.view(-1, soft.shape[-1])[flat] = result.soft_parts
             found.append(replace(result.items, points=flat[result.items.points]))
@@ -722,7 +741,7 @@ class HandAvatar(nn.Module):
         """Pixels within ``margin`` (a share of the picture's width) of the posed mesh."""
         if math.isinf(margin):
             return torch.ones(camera.height, camera.width, dtype=torch.bool, device=self.device)
-        if _kernel(kernel, self.device) == "torch":
+        if settled_kernel(kernel, self.device) == "torch":
             covered = covered_pixels(state.posed.vertices, self.rig.faces, camera)
         else:
             from handavatar.render.fused_coverage import mesh_coverage
@@ -896,11 +915,6 @@ def _sampled(
     return hit, Rays(rays.origins[hit], rays.directions[hit]), depths
 
 
-def _kernel(name: Kernel, device: torch.device) -> Kernel:
-    """What decodes pairs; never ``auto``."""
-    return chosen_kernel(name, device) if name == "auto" else name
-
-
 def _steps(settings: RenderSettings, depths: Float[Tensor, "rays samples"]) -> tuple[int, int]:
     """Which samples are evaluated first, one of so many, and how many of these at a time."""
     if depths.device.type != "cpu" and depths.numel() <= _FEW_ON_A_GPU:
@@ -915,11 +929,20 @@ def _looked_at(num_samples: int, stride: int, device: torch.device) -> Int[Tenso
 
 
 def _places(
-    rays: Rays, depths: Float[Tensor, "rays samples"], samples: Int[Tensor, "chosen 2"]
+    rays: Rays, depths: Float[Tensor, "rays samples"], samples: Int[Tensor, "chosen"]
 ) -> Float[Tensor, "chosen 3"]:
-    """Where samples lie in the world: their rays, and their places in these."""
-    ray, sample = samples.unbind(-1)
-    return rays.origins[ray] + depths[ray, sample][:, None] * rays.directions[ray]
+    """Where samples lie in the world: row by row, their numbers count through all rays."""
+    ray = samples // depths.shape[1]
+    return rays.origins[ray] + depths.flatten()[samples][:, None] * rays.directions[ray]
+
+
+def _replaced(
+    occupancy: Float[Tensor, "rays samples"],
+    samples: Int[Tensor, "chosen"],
+    values: Float[Tensor, "chosen"],
+) -> Float[Tensor, "rays samples"]:
+    """The same with other values at some samples, with their gradient."""
+    return occupancy.flatten().index_put((samples,), values).view_as(occupancy)
 
 
 def _is_edge(alpha: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:

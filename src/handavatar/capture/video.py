@@ -2,11 +2,11 @@
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 import torch
@@ -39,6 +39,8 @@ from handavatar.geometry.cameras import project
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
 
+Piece = TypeVar("Piece")
+Result = TypeVar("Result")
 Progress = Callable[[float, str], None]
 """Told the share of the work that is done, in [0, 1], and what is being done."""
 
@@ -168,12 +170,26 @@ def capture_video(
 def _found_masks(track: Track, report: Progress) -> list[HandMask]:
     report(0.4, "learning the colour of the skin")
     colors = learn_colors(track.hands)
-    masks: list[HandMask] = []
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
-        for mask in pool.map(lambda hand: find_mask(hand, colors), track.hands):
-            masks.append(mask)
-            report(0.4 + 0.25 * len(masks) / len(track.hands), "cutting out the hand")
-    return masks
+    return _on_all_cores(
+        lambda hand: find_mask(hand, colors),
+        track.hands,
+        lambda share: report(0.4 + 0.25 * share, "cutting out the hand"),
+    )
+
+
+def _on_all_cores(
+    work: Callable[[Piece], Result], pieces: Sequence[Piece], report: Callable[[float], None]
+) -> list[Result]:
+    """The work on every piece, in order; told is the share of the pieces that is done."""
+    results: list[Result] = []
+    # Torch's number of threads belongs to a thread.
+    with ThreadPoolExecutor(
+        os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)
+    ) as pool:
+        for result in pool.map(work, pieces):
+            results.append(result)
+            report(len(results) / len(pieces))
+    return results
 
 
 def observations_of(track: Track) -> Observations:
@@ -214,14 +230,9 @@ def _fitted(
         error_metres = float(errors[number] / observations.scale[number])
         return _result(hand, mask, rig, fit, number, vertices[number], error_metres, options.size)
 
-    results: list[FittedFrame] = []
-    # Torch's number of threads belongs to a thread.
-    with ThreadPoolExecutor(
-        os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)
-    ) as pool:
-        for result in pool.map(cropped, range(len(masks))):
-            results.append(result)
-            report(0.85 + 0.1 * len(results) / len(masks), "cropping")
+    results = _on_all_cores(
+        cropped, range(len(masks)), lambda share: report(0.85 + 0.1 * share, "cropping")
+    )
     return fit, results
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from handavatar.field.kernels import Kernel, chosen_kernel
+from handavatar.field.kernels import Kernel, settled_kernel
 from handavatar.geometry.meshes import SurfacePoints, sample_surface_evenly
 from handavatar.hand.rig import Rig
 
@@ -71,8 +71,7 @@ def nearest_anchors(
 
     Source: paper Sec. 3.3, N^n = 4 nearest by Euclidean distance.
     """
-    if kernel == "auto":
-        kernel = chosen_kernel(kernel, queries.device)
+    kernel = settled_kernel(kernel, queries.device)
     if kernel != "torch" and count == NUM_NEIGHBOURS:
         from handavatar.field.fused_anchors import four_nearest
 

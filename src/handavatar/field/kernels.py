@@ -45,6 +45,11 @@ def chosen_kernel(name: Kernel, device: torch.device | str) -> Kernel:
     return name
 
 
+def settled_kernel(name: Kernel, device: torch.device | str) -> Kernel:
+    """What ``auto`` stands for on a device; every other name is taken as it is."""
+    return chosen_kernel(name, device) if name == "auto" else name
+
+
 @cache
 def _has_triton() -> bool:
     return find_spec("triton") is not None

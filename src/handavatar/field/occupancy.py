@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from handavatar.field.kernels import PRECISIONS, Kernel, Precision, chosen_kernel
+from handavatar.field.kernels import PRECISIONS, Kernel, Precision, settled_kernel
 from handavatar.field.layers import PointNet, SkipMLP
 from handavatar.field.threads import mapped
 from handavatar.hand.parts import PartBoxes, Parts
@@ -274,8 +274,7 @@ class PairOccupancy(nn.Module):
         self, codes: HandCodes, points: Float[Tensor, "points 3"], kernel: Kernel = "auto"
     ) -> Occupancy:
         """Occupancy at world points (metres), without gradient; the fast way."""
-        if kernel == "auto":
-            kernel = chosen_kernel(kernel, points.device)
+        kernel = settled_kernel(kernel, points.device)
         if self.is_fused(kernel):
             with torch.no_grad():
                 return self._fused_occupancy(codes, points, kernel)
