@@ -18,6 +18,10 @@ MARKS = [
 _ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
+PATIENCE = 240_000
+"""Milliseconds a page is waited for: no core may be idle."""
+
+
 @contextmanager
 def launched() -> Iterator[Any]:
     """The browser, as long as the block lasts; the fixture ``browser`` is one for a module."""
@@ -25,6 +29,28 @@ def launched() -> Iterator[Any]:
         running = manager.chromium.launch(executable_path=CHROMIUM, args=_ARGUMENTS)
         yield running
         running.close()
+
+
+@contextmanager
+def visit(browser: Any, **options: Any) -> Iterator[Any]:
+    """Somebody of an own context, with the context's options; opens pages, and has patience."""
+    context = browser.new_context(**options)
+    context.set_default_timeout(PATIENCE)
+    try:
+        yield context
+    finally:
+        context.close()
+
+
+@contextmanager
+def late(page: Any, pattern: str) -> Iterator[None]:
+    """What the page asks for within the block is answered after it, if its address matches."""
+    held: list[Any] | None = []
+    page.route(pattern, lambda route: route.continue_() if held is None else held.append(route))
+    yield
+    ready, held = held, None
+    for route in ready:
+        route.continue_()
 
 
 def watched(page: Any, is_expected: Callable[[str], bool]) -> Any:

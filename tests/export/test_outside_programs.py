@@ -8,8 +8,6 @@ system's chromium, driven by playwright. What is missing is skipped.
 import contextlib
 import functools
 import http.server
-import importlib
-import importlib.util
 import json
 import os
 import shutil
@@ -102,22 +100,22 @@ def _served(folder: Path) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def page(folder: Path) -> Iterator[Any]:
     """A page of three.js in chromium."""
-    browser_path = shutil.which("chromium")
-    if browser_path is None or not (NODE_MODULES / "three").is_dir():
+    from chromium import CHROMIUM, launched, visit
+
+    if not CHROMIUM or not (NODE_MODULES / "three").is_dir():
         pytest.skip("no chromium, or no three in HANDAVATAR_NODE_MODULES")
-    if importlib.util.find_spec("playwright") is None:
-        pytest.skip("playwright is not installed")
-    driver = importlib.import_module("playwright.sync_api")
     (folder / "three").symlink_to((NODE_MODULES / "three").resolve())
     shutil.copy(Path(__file__).with_name("three_page.html"), folder / "index.html")
-    arguments = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with _served(folder) as address, driver.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=browser_path, args=arguments)
-        page = browser.new_page(viewport={"width": 640, "height": 640})
+    size = {"width": 640, "height": 640}
+    with (
+        _served(folder) as address,
+        launched() as browser,
+        visit(browser, viewport=size) as context,
+    ):
+        page = context.new_page()
         page.goto(address + "/index.html")
         page.wait_for_function("window.ready")
         yield page
-        browser.close()
 
 
 def _picture(page: Any, path: Path, direction: list[float], up: list[float]) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import Any
 import av
 import numpy as np
 import pytest
-from chromium import MARKS, watched
+from chromium import MARKS, late, visit, watched
 from live import live_server
 from PIL import Image
 
@@ -30,15 +30,16 @@ def server(
 @pytest.fixture
 def page(browser: Any, server: ViewServer) -> Iterator[Any]:
     """The page with a small picture, and a list ``strays`` of what went wrong on it."""
-    context = browser.new_context(viewport={"width": 1100, "height": 800})
-    made = context.new_page()
-    made.set_default_timeout(60_000)
-    watched(made, lambda url: url.startswith((server.address, f"blob:{server.address}")))
-    made.goto(server.address)
-    made.select_option("#size", "64")
-    yield made
-    assert made.strays == []
-    context.close()
+    with visit(browser, viewport={"width": 1100, "height": 800}) as context:
+        made = watched(context.new_page(), lambda url: url.startswith(own_addresses(server)))
+        made.goto(server.address)
+        made.select_option("#size", "64")
+        yield made
+        assert made.strays == []
+
+
+def own_addresses(server: ViewServer) -> tuple[str, str]:
+    return server.address, f"blob:{server.address}"
 
 
 def settled(page: Any, stage: str = "full") -> np.ndarray:
@@ -183,19 +184,18 @@ def test_a_picture_is_painted_and_taken_back(page: Any, server: ViewServer, tmp_
 def test_what_is_no_picture_is_said_on_the_page(
     browser: Any, server: ViewServer, tmp_path: Path
 ) -> None:
-    context = browser.new_context()
-    page = context.new_page()
-    page.goto(server.address)
-    page.wait_for_selector("canvas[data-stage]")
-    (tmp_path / "text.png").write_text("no picture")
-    page.set_input_files("#paint-picture", tmp_path / "text.png")
-    page.wait_for_selector("#problem:not([hidden])")
-    assert "not a PNG" in page.inner_text("#problem")
-    (tmp_path / "large.png").write_bytes(bytes(4 * 2**20 + 1))
-    page.set_input_files("#paint-picture", tmp_path / "large.png")
-    page.wait_for_function("() => problem.textContent.includes('at most 4194304')")
-    assert page.evaluate("scene.touches.strokes.length") == 0
-    context.close()
+    with visit(browser) as context:
+        page = context.new_page()
+        page.goto(server.address)
+        page.wait_for_selector("canvas[data-stage]")
+        (tmp_path / "text.png").write_text("no picture")
+        page.set_input_files("#paint-picture", tmp_path / "text.png")
+        page.wait_for_selector("#problem:not([hidden])")
+        assert "not a PNG" in page.inner_text("#problem")
+        (tmp_path / "large.png").write_bytes(bytes(4 * 2**20 + 1))
+        page.set_input_files("#paint-picture", tmp_path / "large.png")
+        page.wait_for_function("() => problem.textContent.includes('at most 4194304')")
+        assert page.evaluate("scene.touches.strokes.length") == 0
 
 
 def test_a_motion_plays_and_stands_where_it_is_put(page: Any) -> None:
@@ -242,11 +242,12 @@ def test_two_tabs_see_their_own_and_closing_one_leaves_the_other(
     page: Any, browser: Any, server: ViewServer
 ) -> None:
     before = settled(page)
-    other = browser.new_page()
-    other.goto(server.address)
-    other.select_option("#size", "512")
-    other.wait_for_function("() => picture.width == 512")
-    other.close()  # in the middle of its picture in full
+    with visit(browser) as context:
+        other = context.new_page()
+        other.goto(server.address)
+        other.select_option("#size", "512")
+        other.wait_for_function("() => picture.width == 512")
+    # It was closed in the middle of its picture in full.
     move(page, "#light", 0.5)
     darker = settled(page)
     assert darker.sum() < before.sum()
@@ -255,29 +256,42 @@ def test_two_tabs_see_their_own_and_closing_one_leaves_the_other(
 def test_a_page_says_that_the_server_is_gone(
     browser: Any, small_avatar: HandAvatar, tmp_path: Path
 ) -> None:
-    context = browser.new_context()
-    page = context.new_page()
-    with live_server(small_avatar, tmp_path) as server:
-        page.goto(server.address)
+    with visit(browser) as context:
+        page = context.new_page()
+        with live_server(small_avatar, tmp_path) as server:
+            page.goto(server.address)
+            page.wait_for_selector("canvas[data-stage]")
+        move(page, "#light", 0.5)
+        page.wait_for_selector("#problem:not([hidden])")
+        assert "does not answer" in page.inner_text("#problem")
+
+
+def test_a_hand_that_is_not_there_yet_can_be_dragged(browser: Any, server: ViewServer) -> None:
+    with visit(browser) as context:
+        page = watched(context.new_page(), lambda url: url.startswith(own_addresses(server)))
+        with late(page, "**/about"):
+            page.goto(server.address)
+            page.hover("#picture")
+            page.mouse.down()
+            page.mouse.move(20, 30)
+            page.mouse.wheel(0, 100)
+            page.mouse.up()
+            page.press("#picture", "ArrowLeft")
         page.wait_for_selector("canvas[data-stage]")
-    move(page, "#light", 0.5)
-    page.wait_for_selector("#problem:not([hidden])")
-    assert "does not answer" in page.inner_text("#problem")
-    context.close()
+        assert page.strays == []
 
 
 def test_pages_of_other_origins_cannot_ask(browser: Any, server: ViewServer) -> None:
     before = set(server.out.glob("*"))  # Other tests save here, too.
-    context = browser.new_context()
-    page = context.new_page()
-    page.goto("about:blank")
-    for path, options in (
-        ("about", "{}"),
-        ("avatar", "{method: 'POST', body: '{}', mode: 'no-cors'}"),
-    ):
-        tried = page.evaluate(
-            f"fetch('{server.address}{path}', {options}).then(a => a.type, () => 'failed')"
-        )
-        assert tried in ("failed", "opaque")
+    with visit(browser) as context:
+        page = context.new_page()
+        page.goto("about:blank")
+        for path, options in (
+            ("about", "{}"),
+            ("avatar", "{method: 'POST', body: '{}', mode: 'no-cors'}"),
+        ):
+            tried = page.evaluate(
+                f"fetch('{server.address}{path}', {options}).then(a => a.type, () => 'failed')"
+            )
+            assert tried in ("failed", "opaque")
     assert set(server.out.glob("*")) == before
-    context.close()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from chromium import MARKS
+from chromium import MARKS, late, visit
 from source_tree import TOP
 
 from handavatar.train.runs import open_run, read_log
@@ -74,14 +74,11 @@ class Training:
 
 @pytest.fixture
 def page(browser: Any) -> Iterator[Any]:
-    context = browser.new_context(viewport={"width": 1200, "height": 800})
-    made = context.new_page()
-    made.set_default_timeout(240_000)
-    made.strays = []
-    made.on("pageerror", lambda error: made.strays.append(str(error)))
-    yield made
-    assert made.strays == []
-    context.close()
+    strays: list[str] = []
+    with visit(browser, viewport={"width": 1200, "height": 800}) as context:
+        context.on("weberror", lambda error: strays.append(str(error.error)))
+        yield context.new_page()
+        assert strays == []
 
 
 def is_gone(process: int) -> bool:
@@ -115,11 +112,12 @@ def test_losses_and_pictures_change(page: Any, tiny_capture: Path, tmp_path: Pat
         points = int(page.get_attribute("[data-curve='train: loss']", "data-points"))
         assert "steps/s" in page.inner_text("#job") and "left" in page.inner_text("#job")
 
-        # Another tab that is closed in the middle of its picture.
+        # Another tab, whose first answer comes late; it is closed in the middle of its picture.
         other = page.context.new_page()
-        other.goto(training.address(page))
-        other.select_option("#size", "512")
-        other.select_option("#detail", "2")
+        with late(other, "**/training"):
+            other.goto(training.address(page))
+            other.select_option("#size", "512")
+            other.select_option("#detail", "2")
         other.wait_for_function("() => picture.width == 512")
         other.close()
 
@@ -223,7 +221,6 @@ def test_a_killed_trainer_takes_its_page_along_and_view_looks_on_at_another(
         )
         assert watching.stdout is not None
         other = page.context.new_page()
-        other.set_default_timeout(240_000)
         other.goto(watching.stdout.readline().split()[1])
         other.wait_for_selector("#picture[data-version]")
         training.process.kill()

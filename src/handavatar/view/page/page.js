@@ -113,34 +113,37 @@ function zoom(factor) {
   changed();
 }
 
-canvas.addEventListener("pointerdown", (event) => {
-  canvas.setPointerCapture(event.pointerId);
-  places.set(event.pointerId, [event.clientX, event.clientY]);
-  if ($("painting").checked) paintAt(event);
-});
-canvas.addEventListener("pointermove", (event) => {
-  const last = places.get(event.pointerId);
-  if (!last) return;
-  places.set(event.pointerId, [event.clientX, event.clientY]);
-  const [dx, dy] = [event.clientX - last[0], event.clientY - last[1]];
-  if ($("painting").checked) paintAt(event);
-  else if (places.size === 2) zoom(Math.exp(-dy / 200));
-  else if (dx || dy) moveCamera(dx, dy, event.shiftKey || event.buttons & 6);
-});
-for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => places.delete(event.pointerId));
-canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-canvas.addEventListener("wheel", (event) => {
-  event.preventDefault();
-  zoom(Math.exp(-event.deltaY / 600));
-}, { passive: false });
-canvas.addEventListener("keydown", (event) => {
-  const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
-  if (step) moveCamera(step[0] * canvas.clientWidth / 40, step[1] * canvas.clientWidth / 40, event.shiftKey);
-  else if (event.key === "+") zoom(1.1);
-  else if (event.key === "-") zoom(1 / 1.1);
-  else return;
-  event.preventDefault();
-});
+// Once there is something to move.
+function wireCanvas() {
+  canvas.addEventListener("pointerdown", (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    places.set(event.pointerId, [event.clientX, event.clientY]);
+    if ($("painting").checked) paintAt(event);
+  });
+  canvas.addEventListener("pointermove", (event) => {
+    const last = places.get(event.pointerId);
+    if (!last) return;
+    places.set(event.pointerId, [event.clientX, event.clientY]);
+    const [dx, dy] = [event.clientX - last[0], event.clientY - last[1]];
+    if ($("painting").checked) paintAt(event);
+    else if (places.size === 2) zoom(Math.exp(-dy / 200));
+    else if (dx || dy) moveCamera(dx, dy, event.shiftKey || event.buttons & 6);
+  });
+  for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => places.delete(event.pointerId));
+  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+  canvas.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    zoom(Math.exp(-event.deltaY / 600));
+  }, { passive: false });
+  canvas.addEventListener("keydown", (event) => {
+    const step = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] }[event.key];
+    if (step) moveCamera(step[0] * canvas.clientWidth / 40, step[1] * canvas.clientWidth / 40, event.shiftKey);
+    else if (event.key === "+") zoom(1.1);
+    else if (event.key === "-") zoom(1 / 1.1);
+    else return;
+    event.preventDefault();
+  });
+}
 
 // --------------------------------------------------------------------- edits
 
@@ -337,6 +340,7 @@ function on(id, event, act) {
 }
 
 function wire() {
+  wireCanvas();
   for (const layer of about.layers) {
     const line = Object.assign(document.createElement("label"), { className: "tick" });
     const input = Object.assign(document.createElement("input"), { type: "radio", name: "layer", value: layer, checked: layer === "rgb" });

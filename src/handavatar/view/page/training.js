@@ -161,7 +161,8 @@ async function drawForever() {
   let wish = 0;
   let drawn = null;
   for (;;) {
-    if (wish === order && drawn === (about?.avatar ?? null)) await new Promise((wake) => { waiting = wake; });
+    // A wish may be older than the first answer of how far the training is.
+    while (!about?.frames || (wish === order && drawn === about.avatar)) await new Promise((wake) => { waiting = wake; });
     waiting = null;
     wish = order;
     const wanted = { ...view };
