@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import pytest
+from patience import PATIENCE
 
 playwright = pytest.importorskip("playwright.sync_api")
 CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium") or ""
@@ -16,10 +17,6 @@ MARKS = [
 ]
 """Of every test of a page."""
 _ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-
-
-PATIENCE = 240_000
-"""Milliseconds a page is waited for: no core may be idle."""
 
 
 @contextmanager
@@ -35,7 +32,7 @@ def launched() -> Iterator[Any]:
 def visit(browser: Any, **options: Any) -> Iterator[Any]:
     """Somebody of an own context, with the context's options; opens pages, and has patience."""
     context = browser.new_context(**options)
-    context.set_default_timeout(PATIENCE)
+    context.set_default_timeout(1000 * PATIENCE)
     try:
         yield context
     finally:

@@ -181,6 +181,7 @@ def test_frames_of_another_work_are_not_used(
     )
 
 
+@pytest.mark.slow
 def test_two_processes_share_the_frames(
     avatar_file: Path, motion_file: Path, tmp_path: Path
 ) -> None:

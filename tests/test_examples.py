@@ -72,6 +72,7 @@ def saved(small_avatar: HandAvatar, tmp_path_factory: pytest.TempPathFactory) ->
     return path
 
 
+@pytest.mark.slow
 def test_the_first_avatar_is_trained_and_shown(tiny_capture: Path, tmp_path: Path) -> None:
     told = _run_example(
         "01_first_avatar.py", tmp_path, "--capture", tiny_capture, "--steps", 6, before=QUICKLY
@@ -88,6 +89,7 @@ def test_the_first_avatar_is_trained_and_shown(tiny_capture: Path, tmp_path: Pat
         _assert_shows_a_hand(tile)
 
 
+@pytest.mark.slow
 def test_hands_are_posed_and_seen_from_three_sides(saved: Path, tmp_path: Path) -> None:
     _run_example("02_pose_a_hand.py", tmp_path, "--avatar", saved, "--size", SIZE)
     out = tmp_path / "examples-out"
@@ -105,6 +107,7 @@ def test_hands_are_posed_and_seen_from_three_sides(saved: Path, tmp_path: Path) 
     assert float(angles[BONE_NAMES.index("index1"), 1]) == pytest.approx(16.0, abs=1e-2)
 
 
+@pytest.mark.slow
 def test_each_edit_changes_what_it_says_and_nothing_else(saved: Path, tmp_path: Path) -> None:
     before = saved.read_bytes()
     _run_example("03_edit.py", tmp_path, "--avatar", saved, "--out", "o", "--size", SIZE)
@@ -140,6 +143,7 @@ def test_each_edit_changes_what_it_says_and_nothing_else(saved: Path, tmp_path: 
         assert torch.equal(value, edited.state_dict()[name]), name
 
 
+@pytest.mark.slow
 def test_files_for_other_programs_are_whole(saved: Path, tmp_path: Path) -> None:
     for _ in range(2):  # The second time it replaces what it made.
         told = _run_example("04_export.py", tmp_path, "--avatar", saved, "--texture-size", 32)
@@ -168,6 +172,7 @@ def test_without_an_avatar_they_say_who_makes_one(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_the_notebook_tells_the_whole_story(tiny_capture: Path, tmp_path: Path) -> None:
     notebook = json.loads((EXAMPLES / "hand_avatar.ipynb").read_text(encoding="utf-8"))
     sources = ["".join(c["source"]) for c in notebook["cells"] if c["cell_type"] == "code"]

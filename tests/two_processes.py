@@ -5,6 +5,8 @@ import socket
 import subprocess
 import sys
 
+from patience import PATIENCE
+
 PROGRAM = ["-m", "handavatar"]
 
 
@@ -41,7 +43,7 @@ def two_begun(words: list[str], program: list[str] = PROGRAM) -> list[subprocess
 def ended(processes: list[subprocess.Popen[str]]) -> tuple[list[int], str]:
     """Exit codes, and all that was printed to standard error."""
     try:
-        texts = [process.communicate(timeout=60)[1] for process in processes]
+        texts = [process.communicate(timeout=PATIENCE)[1] for process in processes]
     finally:
         for process in processes:
             process.kill()

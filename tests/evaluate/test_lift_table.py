@@ -52,6 +52,7 @@ def test_without_a_finger_its_skin_is_gone_and_what_it_shaded_is_brighter(
     assert float((picture - before)[is_same].abs().mean()) < 0.02
 
 
+@pytest.mark.slow
 def test_the_table_judges_every_avatar_where_the_shadow_falls(
     capture: Capture, small_avatar: HandAvatar, tmp_path: Path
 ) -> None:

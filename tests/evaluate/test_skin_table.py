@@ -56,6 +56,7 @@ def test_a_table_is_markdown_and_json() -> None:
     assert json.loads(json.dumps(table.record()))["rows"]["b"]["y"] == 3
 
 
+@pytest.mark.slow
 def test_bench_makes_the_table_on_a_tiny_budget(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -76,6 +77,7 @@ def test_bench_names_its_tables(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["bench", "--help"]) == 0
 
 
+@pytest.mark.slow
 def test_rig_refine_writes_weights_that_a_rig_takes(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -28,6 +28,7 @@ def options(
     )
 
 
+@pytest.mark.slow
 def test_the_ways_are_timed_on_the_same_pictures(options: SpeedTableOptions) -> None:
     told: list[int] = []
     table = speed_table(options, told.append)

@@ -149,6 +149,7 @@ def test_a_surface_off_the_mesh_moves_the_vertices_along_their_normals(rig: Rig)
     torch.testing.assert_close(found.vertices, expected, atol=1e-6, rtol=0)
 
 
+@pytest.mark.slow
 def test_the_network_learns_light_and_lifted_shadows(rig: Rig) -> None:
     """Of a made light: dark where the thumb is near, unless its shadow is lifted."""
     samples = _made_samples(rig, 12)

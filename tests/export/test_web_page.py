@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from chromium import MARKS, PATIENCE, watched
+from chromium import MARKS, watched
 from conftest import camera_above
+from patience import PATIENCE
 from PIL import Image
 from scipy import ndimage
 
@@ -92,7 +93,7 @@ def write_of_side(side: str, avatar: HandAvatar, light: LightweightHand, folder:
 def opened(browser: Any, folder: Path, script: str = "") -> Any:
     """The page from disk, and a list ``strays`` of what went wrong or was asked for."""
     page = browser.new_context(viewport={"width": 1000, "height": 760}).new_page()
-    page.set_default_timeout(PATIENCE)
+    page.set_default_timeout(1000 * PATIENCE)
     address = (folder / "index.html").as_uri()
     watched(page, lambda url: url == address or url.startswith(("data:", "blob:")))
     if script:

@@ -206,6 +206,7 @@ def test_refined_weights_are_weights_and_at_most_four(problem: SkinRefinement) -
     torch.testing.assert_close(flat, rig.template_vertices, atol=1e-6, rtol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("term", ["smoothness", "surface"])
 def test_each_term_alone_falls_on_unseen_poses(problem: SkinRefinement, term: str) -> None:
     alone = {"smoothness": 0.0, "surface": 0.0, "sparsity": 0.0, term: 1.0}

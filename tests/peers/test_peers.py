@@ -100,6 +100,7 @@ def test_rays_are_seen_alike_alone_and_together(avatar: HandAvatar, frames: list
     assert float(together[:, 3].detach().min()) >= 0 and float(together[:, 3].detach().max()) <= 1
 
 
+@pytest.mark.slow
 def test_both_learn_the_hand_and_the_same_seed_the_same_bits(
     avatar: HandAvatar, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -114,6 +115,7 @@ def test_both_learn_the_hand_and_the_same_seed_the_same_bits(
     assert torch.equal(nerf[1], nerf[2])
 
 
+@pytest.mark.slow
 def test_the_table_is_kept_and_has_every_row(
     tiny_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

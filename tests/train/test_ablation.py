@@ -93,6 +93,7 @@ def test_a_view_shaded_whole_is_what_the_avatar_renders(made: Path) -> None:
     torch.testing.assert_close(picture["light"], expected.illumination, atol=2e-3, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_shading_learns_and_its_figures_are_of_every_frame(
     made: Path, geometry: FittedGeometry
 ) -> None:
@@ -110,6 +111,7 @@ def test_a_shading_learns_and_its_figures_are_of_every_frame(
         assert torch.equal(value, again.state_dict()[name]), name
 
 
+@pytest.mark.slow
 def test_only_light_that_looks_along_the_ray_changes_with_the_camera(
     geometry: FittedGeometry,
 ) -> None:
@@ -126,6 +128,7 @@ def test_only_light_that_looks_along_the_ray_changes_with_the_camera(
     assert 0 < spread[0] < 0.5 * spread[1]
 
 
+@pytest.mark.slow
 def test_the_table_is_kept_and_paired(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -164,6 +167,7 @@ def test_the_table_is_kept_and_paired(
         ablation_table(replace(options, captures=(tmp_path,)))
 
 
+@pytest.mark.slow
 def test_some_rows_of_a_capture_without_truth_and_then_more(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 from conftest import (
     assert_teaches_the_decoder_alone,
@@ -27,6 +28,7 @@ def _error(avatar: HandAvatar, frame: Frame) -> float:
     return float((avatar.alpha(codes, rays, SETTINGS) - frame.alpha[y, x]).abs().mean())
 
 
+@pytest.mark.slow
 def test_the_outline_moves_onto_the_border_of_the_mask() -> None:
     avatar = avatar_of_the_prior()
     errors = [_error(avatar, frame) for frame in FRAMES]

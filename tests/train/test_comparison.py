@@ -54,6 +54,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
     return out, compare_decoders(options, (_volume,))
 
 
+@pytest.mark.slow
 def test_the_result_is_json_and_names_what_was_compared(
     compared: tuple[Path, dict[str, Any]],
 ) -> None:
@@ -78,6 +79,7 @@ def test_the_result_is_json_and_names_what_was_compared(
         assert value["attention"][gesture]["preference"] > 0
 
 
+@pytest.mark.slow
 def test_differences_are_paired_and_over_seeds_too(compared: tuple[Path, dict[str, Any]]) -> None:
     _, value = compared
     for name in ("pair-shuffled", "transformer"):
@@ -90,6 +92,7 @@ def test_differences_are_paired_and_over_seeds_too(compared: tuple[Path, dict[st
                 assert found["low"] <= found["mean"] <= found["high"]
 
 
+@pytest.mark.slow
 def test_the_judging_poses_are_those_of_prior_evaluate(
     compared: tuple[Path, dict[str, Any]],
 ) -> None:
@@ -105,6 +108,7 @@ def test_the_judging_poses_are_those_of_prior_evaluate(
     assert value["decoders"]["transformer"]["iou"] == pytest.approx(sum(scores) / 2, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_table_has_a_line_for_each_decoder(compared: tuple[Path, dict[str, Any]]) -> None:
     _, value = compared
     shown = comparison_table(value).markdown().splitlines()

@@ -89,6 +89,7 @@ class _Onlooker:
                 continue
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("confidence", [1.0, 0.9])
 def test_who_looks_on_changes_no_bit(tmp_path: Path, eager: None, confidence: float) -> None:
     capture = write_tiny_capture(tmp_path / "capture", confidence=confidence)

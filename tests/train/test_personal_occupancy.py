@@ -1,5 +1,6 @@
 """The decoder learns a person's hand before the first step, and nothing else moves."""
 
+import pytest
 import torch
 from conftest import (
     assert_teaches_the_decoder_alone,
@@ -29,6 +30,7 @@ def _error(avatar: HandAvatar, pose: HandPose) -> float:
     return float(torch.nn.functional.binary_cross_entropy(whole, labels.to(whole)))
 
 
+@pytest.mark.slow
 def test_the_field_fits_the_personal_surface_better_in_unseen_poses_too() -> None:
     avatar = avatar_of_the_prior()
     with torch.no_grad():  # Offsets that no shape coefficients give.

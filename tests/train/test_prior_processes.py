@@ -60,6 +60,7 @@ def _log(folder: Path) -> list[dict[str, float]]:
     return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_two_processes_learn_what_one_learns(tmp_path: Path, two_processes: Path) -> None:
     train_prior(_options(tmp_path / "one", 3))
     one, two = load_file(tmp_path / "one"), load_file(two_processes / "two")
@@ -76,6 +77,7 @@ def test_two_processes_learn_what_one_learns(tmp_path: Path, two_processes: Path
     assert sum(shares) == pytest.approx(1)
 
 
+@pytest.mark.slow
 def test_two_processes_stop_together_and_continue_bit_for_bit(
     tmp_path: Path, two_processes: Path
 ) -> None:

@@ -82,6 +82,7 @@ def test_relit_samples_are_those_that_would_be_found(tiny_capture: Path) -> None
     assert torch.equal(relit(avatar, frames, seen).light, moved.light)
 
 
+@pytest.mark.slow
 def test_a_run_with_traced_light_goes_on_to_the_same_bits(
     tiny_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -11,6 +11,7 @@ from handavatar.avatar import HandAvatar
 from handavatar.train.training_table import TrainingTableOptions, gradient_error, training_table
 
 
+@pytest.mark.slow
 def test_training_is_cheaper_and_has_the_same_gradient(
     small_avatar: HandAvatar, tmp_path: Path
 ) -> None:

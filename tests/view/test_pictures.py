@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from live import live_server
+from patience import PATIENCE
 from PIL import Image
 
 from handavatar.avatar import HandAvatar
@@ -60,7 +61,7 @@ def server(
 def send(
     server: ViewServer, content: bytes, path: str = "/paint", kind: str = "image/png", **more: str
 ) -> tuple[int, dict[str, Any]]:
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
     try:
         connection.request("POST", path, content, {"Content-Type": kind} | more)
         answer = connection.getresponse()
@@ -115,7 +116,7 @@ def test_a_painted_picture_is_seen_and_saved(server: ViewServer) -> None:
     assert status == 200 and paint is not None and float(paint.opacity.max()) > 0.5
     scene = {"size": 64, "layer": "albedo", "touches": touches}
     wish = {"client": "p", "order": 1, "stage": 0}
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
     seen = []
     for order, shown in ((1, scene), (2, scene | {"touches": {}})):
         body = json.dumps(wish | {"order": order, "scene": shown})
@@ -171,7 +172,7 @@ def test_a_jpeg_by_another_name_is_refused(server: ViewServer) -> None:
 
 
 def test_pictures_that_are_too_long_or_in_the_wrong_place_are_refused(server: ViewServer) -> None:
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
     connection.putrequest("POST", "/paint")
     connection.putheader("Content-Type", "image/png")
     connection.putheader("Content-Length", str(MOST_PICTURE_BYTES + 1))
@@ -189,7 +190,7 @@ def test_a_few_pictures_at_a_time_are_taken(server: ViewServer) -> None:
     head += "Content-Type: image/png\r\nContent-Length: 1000\r\n\r\n"
     slow = []
     for _ in range(2):
-        connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
+        connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
         connection.connect()
         connection.sock.sendall(head.encode())
         slow.append(connection)
@@ -218,7 +219,7 @@ def test_a_thousand_spoilt_pictures_are_read_or_refused(
         palette.save(buffer, "PNG", **options)
         kinds.append(buffer.getvalue())
     statuses = set()
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
     for _ in range(1000):
         content = bytearray(chance.choice(kinds))
         for _ in range(chance.choice([0, 1, 1, 2, 8])):

@@ -20,6 +20,7 @@ import av
 import numpy as np
 import pytest
 from live import live_server, wave
+from patience import PATIENCE, until
 from PIL import Image
 
 from handavatar.avatar import HandAvatar
@@ -48,7 +49,7 @@ def ask(
     headers: dict[str, str] | None = None,
 ) -> tuple[int, bytes, dict[str, str]]:
     """One request on a connection of its own."""
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=120)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
     try:
         body = None if content is None else json.dumps(content).encode()
         kind = {} if content is None else {"Content-Type": "application/json"}
@@ -143,12 +144,13 @@ def test_a_video_of_a_motion(server: ViewServer) -> None:
     status, data, _ = ask(server, "/film", moving)
     assert status == 200
     name = json.loads(data)["name"]
-    for _ in range(600):
-        progress = json.loads(ask(server, f"/film?name={name}")[1])
-        if progress["state"] != "running":
-            break
-        time.sleep(0.05)
-    assert progress == {"state": "finished", "done": 5, "total": 5, "why": ""}
+
+    def progress() -> dict[str, Any]:
+        found: dict[str, Any] = json.loads(ask(server, f"/film?name={name}")[1])
+        return found
+
+    until(lambda: progress()["state"] != "running")
+    assert progress() == {"state": "finished", "done": 5, "total": 5, "why": ""}
     status, data, headers = ask(server, f"/film.mp4?name={name}")
     assert status == 200 and headers["Content-Type"] == "video/mp4"
     with av.open(io.BytesIO(data)) as film:
@@ -162,13 +164,11 @@ def test_a_video_can_be_stopped_and_too_many_are_sent_away(server: ViewServer) -
     slow = {"scene": {"size": 512, "moment": {"motion": "gestures", "step": 0}}, "stage": 2}
     names = [json.loads(ask(server, "/film", slow)[1])["name"] for _ in range(2)]
     assert ask(server, "/film", slow)[0] == 503
-    begin = time.monotonic()
     for name in names:
         assert ask(server, "/film/cancel", {"name": name})[0] == 200
         # Asked for again it would go on; who stops it no longer asks.
         film = server.films._films[name]
-        while film.state == "running" and time.monotonic() - begin < 60:
-            time.sleep(0.02)
+        until(lambda film=film: film.state != "running")
         assert film.state == "cancelled"
     assert ask(server, f"/film.mp4?name={names[0]}")[0] == 404
     assert_alive(server)
@@ -252,6 +252,7 @@ def _malformed(chance: random.Random, port: int) -> bytes:
     return b"\r\n".join(head) + b"\r\n\r\n" + body
 
 
+@pytest.mark.slow
 def test_ten_thousand_malformed_messages_change_nothing(
     server: ViewServer, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -328,16 +329,11 @@ def test_a_tab_closed_in_mid_frame_ends_its_picture(server: ViewServer) -> None:
     )
     connection = socket.create_connection(("127.0.0.1", server.port))
     connection.sendall((head + content).encode())
-    running = None
-    begin = time.monotonic()
-    while running is None and time.monotonic() - begin < 20:
-        running = server.turns._running["field"]
-        time.sleep(0.01)
+    until(lambda: server.turns._running["field"] is not None)
+    running = server.turns._running["field"]
     assert running is not None and not running.is_stale()
     connection.close()
-    while server.turns._running["field"] is running and time.monotonic() - begin < 30:
-        time.sleep(0.01)
-    assert server.turns._running["field"] is not running
+    until(lambda: server.turns._running["field"] is not running)
     assert_alive(server)
 
 
@@ -345,12 +341,10 @@ def test_dragging_ends_the_picture_in_full_that_is_being_made(server: ViewServer
     done: list[Any] = []
     thread = threading.Thread(target=lambda: done.append(picture(server, "drag", 1, 2, size=512)))
     thread.start()
-    begin = time.monotonic()
-    while server.turns._running["field"] is None and time.monotonic() - begin < 20:
-        time.sleep(0.01)
+    until(lambda: server.turns._running["field"] is not None)
     for order in range(2, 12):
         assert picture(server, "drag", order, orbit={"azimuth": order}).shape == (64, 64, 3)
-    thread.join(60)
+    thread.join(PATIENCE)
     assert done == [204]
 
 
@@ -394,11 +388,11 @@ def test_the_command_serves_tries_the_next_port_and_ends(
             assert address.startswith("http://127.0.0.1:") and f":{port}/" not in address
             found = int(address.rstrip("/").rpartition(":")[2])
             assert f"ssh -L {found}:127.0.0.1:{found} " in lines[1]
-            connection = http.client.HTTPConnection("127.0.0.1", found, timeout=30)
+            connection = http.client.HTTPConnection("127.0.0.1", found, timeout=PATIENCE)
             connection.request("GET", "/about")
             assert "my wave" in json.loads(connection.getresponse().read())["motions"]
             process.send_signal(signal.SIGINT)
-            _, errors = process.communicate(timeout=180)
+            _, errors = process.communicate(timeout=PATIENCE)
         finally:
             process.kill()
         assert process.returncode == 0

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -21,6 +21,7 @@ import pytest
 import torch
 from conftest import write_tiny_capture
 from live import FEW
+from patience import PATIENCE, until
 from PIL import Image
 
 from handavatar import cli
@@ -91,7 +92,7 @@ def trainer(
 
 
 def ask(port: int, path: str, content: Any = None, **headers: str) -> tuple[int, bytes]:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE)
     try:
         if content is None:
             connection.request("GET", path, headers=headers)
@@ -356,17 +357,12 @@ def test_malformed_wishes_are_refused_and_many_clients_are_served(
 
 def test_a_tab_closed_in_mid_frame_ends_its_picture(server: ViewServer) -> None:
     content = json.dumps({"client": "t", "order": 1, "stage": 2, "view": {"size": 512}}).encode()
-    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=60)
+    connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=PATIENCE)
     connection.request("POST", "/picture", content, {"Content-Type": "application/json"})
-    begin = time.monotonic()
-    while server.turns._running["field"] is None and time.monotonic() - begin < 20:
-        time.sleep(0.01)
+    until(lambda: server.turns._running["field"] is not None)
     running = server.turns._running["field"]
-    assert running is not None
     connection.close()
-    while server.turns._running["field"] is running and time.monotonic() - begin < 40:
-        time.sleep(0.01)
-    assert server.turns._running["field"] is not running
+    until(lambda: server.turns._running["field"] is not running)
     assert ask(server.port, "/training")[0] == 200
 
 
@@ -382,13 +378,6 @@ def test_it_goes_over_to_the_avatar(
 
 
 # --- beside a training ----------------------------------------------------------------------------
-
-
-def _until(happens: Callable[[], bool], seconds: float = 120) -> None:
-    end = time.monotonic() + seconds
-    while not happens():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 def test_options_of_the_page_are_refused_without_it_or_if_they_mean_nothing(
@@ -416,7 +405,7 @@ def test_a_page_that_dies_is_said_and_ends_nothing(
         return words in "".join(said)
 
     with page_beside(PageOptions(tmp_path / "none", 0, "127.0.0.1", "")) as page:
-        _until(lambda: has_said("open http://127.0.0.1:"))
+        until(lambda: has_said("open http://127.0.0.1:"))
         port = int("".join(said).split("127.0.0.1:")[1].split("/")[0])
         assert json.loads(ask(port, "/training")[1])["phase"] == "waiting"
         priorities = []
@@ -425,10 +414,10 @@ def test_a_page_that_dies_is_said_and_ends_nothing(
                 priorities.append(os.getpriority(os.PRIO_PROCESS, int(thread.name)))
         assert priorities.count(14) == 2
         os.kill(page._process.pid or 0, signal.SIGKILL)
-        _until(lambda: has_said("the page has ended (exit code -9)"))
+        until(lambda: has_said("the page has ended (exit code -9)"))
         page.stay()  # There is nothing to wait for.
     with page_beside(PageOptions(tmp_path / "none", 0, "127.0.0.1", "")) as page:
-        _until(lambda: has_said("open http://127.0.0.1:"))
+        until(lambda: has_said("open http://127.0.0.1:"))
         process = page._process
     assert process.exitcode is not None
     assert "exit code 0" not in capfd.readouterr().err

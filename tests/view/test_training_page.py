@@ -1,6 +1,7 @@
 """``train --view`` as a person meets it: a real training, a real browser."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from typing import Any
 
 import pytest
 from chromium import MARKS, late, visit
+from patience import PATIENCE, until
 from source_tree import TOP
 
 from handavatar.train.runs import open_run, read_log
@@ -53,15 +55,13 @@ class Training:
     def err(self) -> str:
         return Path(self._err.name).read_text(encoding="utf-8")
 
-    def address(self, page: Any) -> str:
+    def address(self) -> str:
         """As it is said, once it is."""
-        for _ in range(1200):
-            for line in self.err.splitlines():
-                if line.startswith("open http://"):
-                    return line.split()[1]
-            assert self.process.poll() is None, self.err
-            page.wait_for_timeout(50)
-        raise AssertionError(self.err)
+        line = re.compile(r"^open (http://\S+)\n", re.MULTILINE)
+        until(lambda: line.search(self.err) is not None or self.process.poll() is not None)
+        found = line.search(self.err)
+        assert found is not None, self.err
+        return found[1]
 
     def page_processes(self) -> list[int]:
         children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text()
@@ -93,7 +93,7 @@ def test_losses_and_pictures_change(page: Any, tiny_capture: Path, tmp_path: Pat
     # Longer than any picture takes where no core is idle.
     training = Training(tmp_path, tiny_capture, "run", "--steps", "100000", "--view", "--port", "0")
     try:
-        page.goto(training.address(page))
+        page.goto(training.address())
         page.select_option("#size", "128")
         page.wait_for_selector("#job[data-phase=training][data-job=train]")
         page.check("input[name=layer][value=rgb]")
@@ -115,7 +115,7 @@ def test_losses_and_pictures_change(page: Any, tiny_capture: Path, tmp_path: Pat
         # Another tab, whose first answer comes late; it is closed in the middle of its picture.
         other = page.context.new_page()
         with late(other, "**/training"):
-            other.goto(training.address(page))
+            other.goto(training.address())
             other.select_option("#size", "512")
             other.select_option("#detail", "2")
         other.wait_for_function("() => picture.width == 512")
@@ -136,7 +136,7 @@ def test_losses_and_pictures_change(page: Any, tiny_capture: Path, tmp_path: Pat
             arg=points,
         )
         training.process.send_signal(signal.SIGINT)
-        assert training.process.wait(120) == 130
+        assert training.process.wait(PATIENCE) == 130
         assert "Traceback" not in training.err
     finally:
         training.process.kill()
@@ -150,7 +150,7 @@ def test_the_page_becomes_the_viewer_and_training_is_the_same(
     assert alone.process.wait(1800) == 0, alone.err
     training = Training(tmp_path, tiny_capture, "seen", *steps, "--view", "--port", "0")
     try:
-        page.goto(training.address(page))
+        page.goto(training.address())
         # It goes over by itself, and the ordinary page works.
         page.wait_for_selector("#gesture")
         page.wait_for_selector("canvas[data-stage=fluid], canvas[data-stage=half]")
@@ -159,7 +159,7 @@ def test_the_page_becomes_the_viewer_and_training_is_the_same(
         assert f"run: {training.run}" in training.out
         (viewer,) = training.page_processes()
         training.process.send_signal(signal.SIGINT)
-        assert training.process.wait(60) == 0
+        assert training.process.wait(PATIENCE) == 0
         assert is_gone(viewer)
         assert "Traceback" not in training.err and "the page has ended" not in training.err
     finally:
@@ -172,12 +172,12 @@ def test_the_page_becomes_the_viewer_and_training_is_the_same(
 def test_ctrl_c_ends_both_and_saves(page: Any, tiny_capture: Path, tmp_path: Path) -> None:
     training = Training(tmp_path, tiny_capture, "run", "--steps", "100000", "--view", "--port", "0")
     try:
-        page.goto(training.address(page))
+        page.goto(training.address())
         page.wait_for_selector("#job[data-job=train]")
         page.wait_for_selector("#picture[data-version]")
         (viewer,) = training.page_processes()
         training.process.send_signal(signal.SIGINT)
-        assert training.process.wait(120) == 130
+        assert training.process.wait(PATIENCE) == 130
         assert "interrupted: stopped at step" in training.err
         assert is_gone(viewer)
         page.wait_for_function("() => problem.textContent.includes('does not answer')")
@@ -192,7 +192,7 @@ def test_a_killed_page_is_said_and_training_goes_on(
 ) -> None:
     training = Training(tmp_path, tiny_capture, "run", "--steps", "60", "--view", "--port", "0")
     try:
-        page.goto(training.address(page))
+        page.goto(training.address())
         (viewer,) = training.page_processes()
         os.kill(viewer, signal.SIGKILL)
         assert training.process.wait(300) == 0  # Nothing is left to stay for.
@@ -209,7 +209,7 @@ def test_a_killed_trainer_takes_its_page_along_and_view_looks_on_at_another(
     words = ["view", str(training.run), "--port", "0"]
     watching = None
     try:
-        page.goto(training.address(page))
+        page.goto(training.address())
         page.wait_for_selector("#job[data-job=train]")
         (viewer,) = training.page_processes()
         # `handavatar view` of a run that is being trained looks on as well.
@@ -227,13 +227,9 @@ def test_a_killed_trainer_takes_its_page_along_and_view_looks_on_at_another(
         training.process.wait()
         other.wait_for_selector("#job[data-phase=stopped]")
         assert "has stopped" in other.inner_text("#job")
-        for _ in range(200):
-            if is_gone(viewer):
-                break
-            page.wait_for_timeout(50)
-        assert is_gone(viewer)
+        until(lambda: is_gone(viewer))
         watching.send_signal(signal.SIGINT)
-        assert watching.wait(60) == 0
+        assert watching.wait(PATIENCE) == 0
     finally:
         training.process.kill()
         if watching is not None:

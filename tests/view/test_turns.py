@@ -4,6 +4,7 @@ import threading
 import time
 
 import pytest
+from patience import PATIENCE
 
 from handavatar.view.share import Share
 from handavatar.view.turns import Busy, Job, Overtaken, Turns
@@ -45,13 +46,13 @@ def test_jobs_are_done_and_give_what_they_made_or_raised(turns: Turns) -> None:
 def test_a_newer_wish_ends_the_older_ones_in_all_lanes(turns: Turns) -> None:
     slow = Slow()
     running = turns.submit("field", "a", 1, slow)
-    assert slow.begun.wait(5)
+    assert slow.begun.wait(PATIENCE)
     begin = time.monotonic()
     newer = turns.submit("fluid", "a", 2, lambda job: "newest")
     assert newer.result() == "newest"
     with pytest.raises(Overtaken):
         running.result()
-    assert time.monotonic() - begin < 2
+    assert time.monotonic() - begin < 20
     with pytest.raises(Overtaken):
         turns.submit("field", "a", 1, slow)
 
@@ -59,7 +60,7 @@ def test_a_newer_wish_ends_the_older_ones_in_all_lanes(turns: Turns) -> None:
 def test_of_many_wishes_that_wait_only_the_newest_is_made(turns: Turns) -> None:
     slow, made = Slow(), []
     turns.submit("field", "other", 1, slow)
-    assert slow.begun.wait(5)
+    assert slow.begun.wait(PATIENCE)
 
     def note(job: Job) -> int:
         made.append(job.order)
@@ -76,7 +77,7 @@ def test_of_many_wishes_that_wait_only_the_newest_is_made(turns: Turns) -> None:
 def test_one_client_does_not_end_anothers_wishes(turns: Turns) -> None:
     slow = Slow()
     first = turns.submit("field", "a", 1, slow)
-    assert slow.begun.wait(5)
+    assert slow.begun.wait(PATIENCE)
     for order in range(50):
         assert turns.submit("fluid", "b", order, lambda job: job.order).result() == order
     assert not first.is_stale()
@@ -87,7 +88,7 @@ def test_one_client_does_not_end_anothers_wishes(turns: Turns) -> None:
 def test_clients_take_turns(turns: Turns) -> None:
     slow, made = Slow(), []
     turns.submit("field", "first", 1, slow)
-    assert slow.begun.wait(5)
+    assert slow.begun.wait(PATIENCE)
     jobs = []
     for order in (1, 2, 3):
         for client in "abc":
@@ -101,7 +102,7 @@ def test_clients_take_turns(turns: Turns) -> None:
 def test_too_many_that_wait_are_sent_away(turns: Turns) -> None:
     slow = Slow()
     turns.submit("field", "first", 1, slow)
-    assert slow.begun.wait(5)
+    assert slow.begun.wait(PATIENCE)
     waiting = [turns.submit("field", f"{n}", 1, lambda job: job.client) for n in range(4)]
     with pytest.raises(Busy):
         turns.submit("field", "one more", 1, lambda job: None)
@@ -115,7 +116,7 @@ def test_a_dropped_job_is_not_begun_and_a_closed_house_takes_none() -> None:
     turns = Turns({"field": nothing})
     slow = Slow()
     running = turns.submit("field", "a", 1, slow)
-    assert slow.begun.wait(5)
+    assert slow.begun.wait(PATIENCE)
     waiting = turns.submit("field", "b", 1, lambda job: pytest.fail("it was begun"))
     waiting.drop()
     turns.close()
@@ -169,4 +170,4 @@ def test_rest_ends_with_the_wish_and_with_the_lanes() -> None:
         running.result()
     begin = time.monotonic()
     turns.close()
-    assert time.monotonic() - begin < 2
+    assert time.monotonic() - begin < 20
