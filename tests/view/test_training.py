@@ -31,6 +31,7 @@ from handavatar.train import live
 from handavatar.train.live import live_folder, shown_live
 from handavatar.train.progress import Progress
 from handavatar.train.runs import Run, append_log, create_run, truncate_log
+from handavatar.view import server as view_server
 from handavatar.view.beside import PageOptions, page_beside
 from handavatar.view.guard import guard_of
 from handavatar.view.scene import SceneError, View
@@ -293,7 +294,11 @@ def test_a_damaged_avatar_is_an_error_that_the_next_one_mends(trainer: Trainer) 
 
 
 @pytest.fixture
-def server(trainer: Trainer, tmp_path: Path) -> Iterator[ViewServer]:
+def server(
+    trainer: Trainer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[ViewServer]:
+    # At its share of the cores it would rest for minutes; see tests/view/test_turns.py.
+    monkeypatch.setattr(view_server, "_SHARE", 100.0)
     trainer.step(1, loss=0.5)
     trainer.step(2, loss=0.4)
     with serving(ViewServer(trainer.watch, guard_of("127.0.0.1", ""), 0, tmp_path)) as running:
