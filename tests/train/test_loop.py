@@ -246,6 +246,7 @@ train(options)
 """Imports once; every training is a fork of its own, killed at a moment the test draws."""
 
 
+@pytest.mark.slow
 def test_killed_at_random_moments_and_resumed_gives_the_same_weights_bit_by_bit(
     tiny_capture: Path, whole_run: Path, tmp_path: Path
 ) -> None:

@@ -270,6 +270,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_a_kill_while_saving_never_loses_the_last_checkpoint(tmp_path: Path) -> None:
     """SIGKILL at random moments: the newest checkpoint is whole and never older than before."""
     chance = random.Random(3)
