@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from chromium import MARKS, watched
+from chromium import MARKS, visit, watched
 from conftest import camera_above
-from patience import PATIENCE
 from PIL import Image
 from scipy import ndimage
 
@@ -90,12 +89,18 @@ def write_of_side(side: str, avatar: HandAvatar, light: LightweightHand, folder:
         avatar.info = before
 
 
-def opened(browser: Any, folder: Path, script: str = "") -> Any:
+@pytest.fixture
+def context(browser: Any) -> Iterator[Any]:
+    with visit(browser, viewport={"width": 1000, "height": 760}) as made:
+        yield made
+
+
+def opened(context: Any, folder: Path, script: str = "") -> Any:
     """The page from disk, and a list ``strays`` of what went wrong or was asked for."""
-    page = browser.new_context(viewport={"width": 1000, "height": 760}).new_page()
-    page.set_default_timeout(1000 * PATIENCE)
     address = (folder / "index.html").as_uri()
-    watched(page, lambda url: url == address or url.startswith(("data:", "blob:")))
+    page = watched(
+        context.new_page(), lambda url: url == address or url.startswith(("data:", "blob:"))
+    )
     if script:
         page.add_init_script(script)
     page.goto(address)
@@ -104,11 +109,10 @@ def opened(browser: Any, folder: Path, script: str = "") -> Any:
 
 
 @pytest.fixture
-def page(browser: Any, folder: Path) -> Iterator[Any]:
-    made = opened(browser, folder)
+def page(context: Any, folder: Path) -> Iterator[Any]:
+    made = opened(context, folder)
     yield made
     assert made.strays == []
-    made.context.close()
 
 
 def settled(page: Any) -> np.ndarray:
@@ -183,8 +187,8 @@ def test_the_page_opens_from_disk_and_shows_a_hand(page: Any) -> None:
     assert page.is_hidden("#problem") and page.is_hidden("#headset")
 
 
-def test_nothing_that_is_not_in_the_policy_runs(browser: Any, folder: Path) -> None:
-    page = opened(browser, folder)
+def test_nothing_that_is_not_in_the_policy_runs(context: Any, folder: Path) -> None:
+    page = opened(context, folder)
     # Later, and not at once: what a debugger evaluates itself is exempt.
     tried = page.evaluate(
         """() => new Promise((done) => setTimeout(() => {
@@ -199,7 +203,6 @@ def test_nothing_that_is_not_in_the_policy_runs(browser: Any, folder: Path) -> N
         }))"""
     )
     assert tried == [[], False]
-    page.context.close()
 
 
 def test_posed_vertices_and_their_light_are_ours(
@@ -348,34 +351,32 @@ def test_a_picture_is_saved(page: Any) -> None:
 
 
 def test_paint_covers_the_skin(
-    browser: Any, avatar: HandAvatar, light: LightweightHand, tmp_path: Path
+    context: Any, avatar: HandAvatar, light: LightweightHand, tmp_path: Path
 ) -> None:
     blue = torch.tensor([0.1, 0.2, 0.9])
     count = len(avatar.anchor_corners)
     paint = Paint(blue.expand(count, 3).contiguous(), torch.ones(count))
     painted = lightweight_hand(avatar, Edit(paint=paint), effort=Effort(2, 1))
     write(tmp_path, web_files(avatar, painted, Edit()))
-    page = opened(browser, tmp_path)
+    page = opened(context, tmp_path)
     seen = shot(page, HandPose.flat(), camera_above(32), "albedo", shift=[0.3, 0, 0])
     # Paint lies over the shifted skin.
     np.testing.assert_allclose(seen[16, 16], blue.numpy(), atol=0.01)
     assert page.strays == []
-    page.context.close()
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_a_left_hand_is_the_mirror_image(
-    browser: Any, avatar: HandAvatar, light: LightweightHand, tmp_path: Path, side: str
+    context: Any, avatar: HandAvatar, light: LightweightHand, tmp_path: Path, side: str
 ) -> None:
     write_of_side(side, avatar, light, tmp_path)
-    page = opened(browser, tmp_path)
+    page = opened(context, tmp_path)
     camera, pose = camera_above(64), HandPose.flat()
     seen = shot(page, pose, camera, "albedo").sum(-1) > 0
     rendered = avatar.render(pose, camera).alpha.numpy() > 0.5
     expected = rendered if side == "right" else rendered[:, ::-1]
     assert (seen & expected).sum() / (seen | expected).sum() > 0.9
     assert page.strays == []
-    page.context.close()
 
 
 def tracked(
@@ -409,11 +410,11 @@ def tracked(
 
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_a_tracked_hand_moves_the_avatar(
-    browser: Any, avatar: HandAvatar, light: LightweightHand, tmp_path: Path, side: str
+    context: Any, avatar: HandAvatar, light: LightweightHand, tmp_path: Path, side: str
 ) -> None:
     """Joints as a headset tells them, of our own hand: the avatar takes its very pose."""
     write_of_side(side, avatar, light, tmp_path)
-    page = opened(browser, tmp_path, FAKE_XR)
+    page = opened(context, tmp_path, FAKE_XR)
     page.wait_for_function("() => !document.getElementById('headset').hidden")
     world = torch.tensor(page.evaluate("() => window.handavatar.headset.world")).view(3, 3).float()
     for pose in poses(avatar, 3):
@@ -446,7 +447,6 @@ def test_a_tracked_hand_moves_the_avatar(
     page.evaluate("() => window.fakeWebXr.end()")
     assert 0.08 < (settled(page).sum(-1) > 40).mean() < 0.7
     assert page.strays == []
-    page.context.close()
 
 
 def _matrix(axis_angle: torch.Tensor) -> torch.Tensor:

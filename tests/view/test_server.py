@@ -334,6 +334,7 @@ def test_a_tab_closed_in_mid_frame_ends_its_picture(server: ViewServer) -> None:
     assert running is not None and not running.is_stale()
     connection.close()
     until(lambda: server.turns._running["field"] is not running)
+    assert running.is_stale()
     assert_alive(server)
 
 

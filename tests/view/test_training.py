@@ -294,11 +294,13 @@ def test_a_damaged_avatar_is_an_error_that_the_next_one_mends(trainer: Trainer) 
 
 
 @pytest.fixture
-def server(
-    trainer: Trainer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[ViewServer]:
-    # At its share of the cores it would rest for minutes; see tests/view/test_turns.py.
+def without_rests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Many pictures at the share of the cores that a page has would take minutes."""
     monkeypatch.setattr(view_server, "_SHARE", 100.0)
+
+
+@pytest.fixture
+def server(trainer: Trainer, tmp_path: Path) -> Iterator[ViewServer]:
     trainer.step(1, loss=0.5)
     trainer.step(2, loss=0.4)
     with serving(ViewServer(trainer.watch, guard_of("127.0.0.1", ""), 0, tmp_path)) as running:
@@ -339,6 +341,7 @@ def test_strangers_are_refused(server: ViewServer, trainer: Trainer, tmp_path: P
         assert ask(other.port, "/training", Cookie=f"{other.guard.cookie}=secret")[0] == 200
 
 
+@pytest.mark.usefixtures("without_rests")
 def test_malformed_wishes_are_refused_and_many_clients_are_served(
     server: ViewServer, capfd: pytest.CaptureFixture[str]
 ) -> None:
@@ -366,8 +369,10 @@ def test_a_tab_closed_in_mid_frame_ends_its_picture(server: ViewServer) -> None:
     connection.request("POST", "/picture", content, {"Content-Type": "application/json"})
     until(lambda: server.turns._running["field"] is not None)
     running = server.turns._running["field"]
+    assert running is not None and not running.is_stale()
     connection.close()
     until(lambda: server.turns._running["field"] is not running)
+    assert running.is_stale()
     assert ask(server.port, "/training")[0] == 200
 
 

@@ -52,7 +52,7 @@ def test_a_newer_wish_ends_the_older_ones_in_all_lanes(turns: Turns) -> None:
     assert newer.result() == "newest"
     with pytest.raises(Overtaken):
         running.result()
-    assert time.monotonic() - begin < 20
+    assert time.monotonic() - begin < 2
     with pytest.raises(Overtaken):
         turns.submit("field", "a", 1, slow)
 
@@ -170,4 +170,4 @@ def test_rest_ends_with_the_wish_and_with_the_lanes() -> None:
         running.result()
     begin = time.monotonic()
     turns.close()
-    assert time.monotonic() - begin < 20
+    assert time.monotonic() - begin < 2
