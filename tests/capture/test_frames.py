@@ -1,6 +1,8 @@
 import json
 import struct
 import zlib
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -305,3 +307,41 @@ def test_further_files_go_along(tmp_path):
         writer.add(make_frame(0))
         writer.file("truth/options.json").write_text("{}")
     assert (tmp_path / "new/truth/options.json").read_text() == "{}"
+
+
+def test_what_is_known_gains_and_covariances_come_back(tmp_path: Path) -> None:
+    frames = []
+    for index in range(2):
+        frame = make_frame(index)
+        known = torch.ones_like(frame.mask)
+        known[:, :3] = False
+        covariance = torch.eye(51) * (1 + index)
+        frames.append(
+            replace(frame, known=known, gain=torch.tensor([1.1, 1.0, 0.9]), covariance=covariance)
+        )
+    capture = write_capture(tmp_path / "c", frames, **HEADER)
+    for index, frame in enumerate(frames):
+        found = capture.frame(index)
+        assert torch.equal(found.known, frame.known)
+        assert torch.allclose(found.gain, frame.gain)
+        assert torch.equal(found.covariance, frame.covariance)
+        # A pixel of which nothing is known is not hand, whatever the mask says.
+        assert not bool(found.mask[:, :3].any()) and bool(found.mask.any())
+
+
+def test_captures_that_say_nothing_of_it_know_everything(tmp_path: Path) -> None:
+    frame = write_capture(tmp_path / "c", [make_frame(0)], **HEADER).frame(0)
+    assert bool(frame.known.all()) and frame.covariance is None
+    assert torch.equal(frame.gain, torch.ones(3))
+    assert not (tmp_path / "c" / "known").exists()
+
+
+@pytest.mark.parametrize("gain", [[0.0, 1, 1], [1, 1], [1, 1, 1e9]])
+def test_gains_that_make_no_sense_are_refused(tmp_path: Path, gain: list[float]) -> None:
+    write_capture(tmp_path / "c", [make_frame(0)], **HEADER)
+    file = tmp_path / "c" / "transforms.json"
+    content = json.loads(file.read_text())
+    content["frames"][0]["gain"] = gain
+    file.write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match="gain"):
+        read_capture(tmp_path / "c")

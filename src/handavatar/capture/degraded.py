@@ -134,6 +134,8 @@ def _degraded(frame: Frame, options: DegradeOptions, random: np.random.Generator
         confidence=min(frame.confidence, _TRACKED) if options.pose_noise else frame.confidence,
         split=frame.split,
         time=frame.time,
+        known=frame.known,
+        gain=frame.gain,
     )
 
 

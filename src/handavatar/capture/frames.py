@@ -28,6 +28,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from handavatar.capture.checks import (
@@ -47,6 +49,9 @@ from handavatar.hand.pose import NUM_BONES, HandPose
 SCHEMA = 1
 SPLITS = ("train", "val", "test")
 MAX_FRAMES = 100_000
+COVARIANCES = "covariances.safetensors"
+"""File of a capture: tensor ``covariance``, one matrix per frame, in the order of the frames."""
+_MAKE_AGAIN = "make the capture again, or delete this file: poses then count as less sure"
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +68,13 @@ class Frame:
         confidence: how far the pose is to be trusted, in [0, 1].
         split: ``train``, ``val`` or ``test``.
         time: seconds since the start of the recording.
+        known: false where nothing is known: outside the camera's picture, under a sleeve or an
+            object, or where the mask is unsure. Such a pixel is neither hand nor background, and
+            counts in no loss and no figure. All are known if it is left out.
+        gain: of red, green and blue: by how much exposure and white balance make this picture
+            brighter than the capture's average; ones if it is left out.
+        covariance: of the pose's errors, rotations bone by bone (radians) and then translation
+            (metres); None where the capture does not say.
     """
 
     name: str
@@ -73,11 +85,21 @@ class Frame:
     confidence: float
     split: str
     time: float
+    known: Bool[Tensor, "height width"] = None  # type: ignore[assignment]
+    gain: Float[Tensor, "3"] = None  # type: ignore[assignment]
+    covariance: Float[Tensor, "51 51"] | None = None
+
+    def __post_init__(self) -> None:
+        """Fills in what most pictures need not say."""
+        if self.known is None:
+            object.__setattr__(self, "known", torch.ones_like(self.coverage, dtype=torch.bool))
+        if self.gain is None:
+            object.__setattr__(self, "gain", torch.ones(3))
 
     @property
     def mask(self) -> Bool[Tensor, "height width"]:
-        """True where the hand covers at least half of the pixel."""
-        return self.coverage > 127
+        """True where the hand is known to cover at least half of the pixel."""
+        return (self.coverage > 127) & self.known
 
     @property
     def alpha(self) -> Float[Tensor, "height width"]:
@@ -93,6 +115,7 @@ class FrameRecord:
         name: as in :class:`Frame`, and so are the fields not named here.
         file_path: picture, relative to the folder.
         mask_path: mask, relative to the folder.
+        known_path: what is known, relative to the folder; empty if everything is.
     """
 
     name: str
@@ -103,6 +126,8 @@ class FrameRecord:
     confidence: float
     split: str
     time: float
+    known_path: str = ""
+    gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -165,6 +190,10 @@ class Capture:
         size = (record.camera.width, record.camera.height)
         image = _pixels(self.folder, record.file_path, size, ("RGB",), record.name)
         mask = _pixels(self.folder, record.mask_path, size, ("L", "1"), record.name)
+        known = None
+        if record.known_path:
+            known = _pixels(self.folder, record.known_path, size, ("L", "1"), record.name)
+            known = torch.from_numpy(known > 0)
         return Frame(
             name=record.name,
             image=torch.from_numpy(image),
@@ -174,7 +203,33 @@ class Capture:
             confidence=record.confidence,
             split=record.split,
             time=record.time,
+            known=known,  # type: ignore[arg-type]
+            gain=torch.tensor(record.gain),
+            covariance=None if self.covariances is None else self.covariances[index],
         )
+
+    @cached_property
+    def covariances(self) -> Float[Tensor, "frames 51 51"] | None:
+        """Of every frame's pose, as in :class:`Frame`; None where the capture does not say.
+
+        Raises:
+            CaptureError: if the file does not fit the frames.
+        """
+        path = self.folder / COVARIANCES
+        if not path.is_file():
+            return None
+        try:
+            tensors = load_file(path)
+            found = tensors["covariance"].float()
+        except (SafetensorError, KeyError, OSError) as error:
+            raise CaptureError(f"{COVARIANCES} cannot be read ({error})", _MAKE_AGAIN) from error
+        if found.shape != (len(self.records), 51, 51) or not bool(torch.isfinite(found).all()):
+            raise CaptureError(
+                f"{COVARIANCES} has shape {tuple(found.shape)} or is not finite, expected "
+                f"({len(self.records)}, 51, 51)",
+                _MAKE_AGAIN,
+            )
+        return found
 
     def split(self, name: str) -> tuple[int, ...]:
         """Indices of the frames of ``train``, ``val`` or ``test``; may be empty."""
@@ -320,6 +375,22 @@ def _record(
             "make both the same size",
         )
     camera = _camera({**content, **entry}, size)
+    known_path = entry.get("known_path")
+    if known_path is not None:
+        known_path = path_inside(folder, known_path)
+        known_size = _size_of_picture(known_path, ("L", "1"))
+        if known_size != size:
+            raise CaptureError(
+                f"{entry['known_path']} is {known_size[0]} x {known_size[1]}, "
+                f"the picture {size[0]} x {size[1]}",
+                "make both the same size",
+            )
+    gain = numbers(entry.get("gain", [1.0, 1.0, 1.0]), (3,), "gain")
+    if not (0.01 <= gain.min() and gain.max() <= 100):
+        raise CaptureError(
+            f"gain is {gain.round(3).tolist()}, expected 0.01 to 100 for each channel",
+            "leave it out if exposure and white balance are steady",
+        )
     hand = entry.get("hand")
     if not isinstance(hand, dict):
         raise CaptureError("the frame has no hand pose", 'write hand: {"rotations": ...}')
@@ -347,6 +418,8 @@ def _record(
         confidence=number(hand.get("confidence", 1.0), "confidence", 0.0, 1.0),
         split=text_field(entry, "split", SPLITS),
         time=number(entry.get("time", float(index)), "time"),
+        known_path="" if known_path is None else known_path.relative_to(folder).as_posix(),
+        gain=(float(gain[0]), float(gain[1]), float(gain[2])),
     )
 
 
@@ -456,6 +529,7 @@ class CaptureWriter:
         if shape_coefficients is not None:
             self._header["shape_coefficients"] = shape_coefficients.double().tolist()
         self._entries: list[dict[str, Any]] = []
+        self._covariances: list[Tensor | None] = []
         self._refuse_folder_in_use()
 
     def _refuse_folder_in_use(self) -> None:
@@ -506,11 +580,20 @@ class CaptureWriter:
                 )
         Image.fromarray(frame.image.cpu().numpy()).save(self.file(image_path))
         Image.fromarray(frame.coverage.cpu().numpy()).save(self.file(mask_path))
+        said = {}
+        if not bool(frame.known.all()):
+            said["known_path"] = f"known/{frame.name}.png"
+            known = frame.known.byte().cpu().numpy() * np.uint8(255)
+            Image.fromarray(known).save(self.file(said["known_path"]))
+        if not bool((frame.gain == 1).all()):
+            said["gain"] = frame.gain.double().tolist()
+        self._covariances.append(frame.covariance)
         camera = frame.camera
         self._entries.append(
             {
                 "file_path": image_path,
                 "mask_path": mask_path,
+                **said,
                 "fl_x": camera.focal[0],
                 "fl_y": camera.focal[1],
                 "cx": camera.center[0],
@@ -550,6 +633,15 @@ class CaptureWriter:
             text = json.dumps(content, allow_nan=False)
         except ValueError as error:
             raise CaptureError("a camera or time is not finite", "drop the frame") from error
+        covariances = [matrix for matrix in self._covariances if matrix is not None]
+        if covariances:
+            if len(covariances) != len(self._entries):
+                raise CaptureError(
+                    f"{len(covariances)} of {len(self._entries)} frames say how sure they are",
+                    "give all frames a covariance, or none",
+                )
+            stacked = torch.stack(covariances).detach().cpu().float().contiguous()
+            save_file({"covariance": stacked}, self._aside / COVARIANCES)
         with open(self._aside / "transforms.json", "w", encoding="utf-8") as stream:
             stream.write(text)
             stream.flush()
