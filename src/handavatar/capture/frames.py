@@ -190,10 +190,9 @@ class Capture:
         size = (record.camera.width, record.camera.height)
         image = _pixels(self.folder, record.file_path, size, ("RGB",), record.name)
         mask = _pixels(self.folder, record.mask_path, size, ("L", "1"), record.name)
-        known = None
+        known = np.ones(mask.shape, dtype=bool)
         if record.known_path:
-            known = _pixels(self.folder, record.known_path, size, ("L", "1"), record.name)
-            known = torch.from_numpy(known > 0)
+            known = _pixels(self.folder, record.known_path, size, ("L", "1"), record.name) > 0
         return Frame(
             name=record.name,
             image=torch.from_numpy(image),
@@ -203,7 +202,7 @@ class Capture:
             confidence=record.confidence,
             split=record.split,
             time=record.time,
-            known=known,  # type: ignore[arg-type]
+            known=torch.from_numpy(known),
             gain=torch.tensor(record.gain),
             covariance=None if self.covariances is None else self.covariances[index],
         )
@@ -386,7 +385,7 @@ def _record(
                 "make both the same size",
             )
     gain = numbers(entry.get("gain", [1.0, 1.0, 1.0]), (3,), "gain")
-    if not (0.01 <= gain.min() and gain.max() <= 100):
+    if not (gain.min() >= 0.01 and gain.max() <= 100):
         raise CaptureError(
             f"gain is {gain.round(3).tolist()}, expected 0.01 to 100 for each channel",
             "leave it out if exposure and white balance are steady",
