@@ -129,20 +129,22 @@ def limit_excess(
     penalty when a pose is fitted.
     """
     angles = angles_from_rotations(rig, rotations)
-    least, greatest = _limits_at(angles)
+    least, greatest = limit_bounds(angles)
     return ((least - angles).relu() + (angles - greatest).relu()).sum(-1)
 
 
 def clamped_angles(angles: Float[Tensor, "*batch bones 3"]) -> Float[Tensor, "*batch bones 3"]:
     """The nearest angles (radians) inside the limits, flexion first."""
-    flexion_least, flexion_greatest = (bound[..., 0] for bound in _limits_at(angles))
+    flexion_least, flexion_greatest = (bound[..., 0] for bound in limit_bounds(angles))
     flexion = angles[..., 0].clamp(flexion_least, flexion_greatest)
     angles = torch.cat([flexion[..., None], angles[..., 1:]], dim=-1)
-    least, greatest = _limits_at(angles)
+    least, greatest = limit_bounds(angles)
     return angles.clamp(least, greatest)
 
 
-def _limits_at(angles: Tensor) -> tuple[Tensor, Tensor]:
+def limit_bounds(
+    angles: Float[Tensor, "*batch bones 3"],
+) -> tuple[Float[Tensor, "*batch bones 3"], Float[Tensor, "*batch bones 3"]]:
     """Least and greatest angles in radians, which for abduction depend on the flexion."""
     # No angle reaches a full turn, so the wrist stays free; infinity would spoil the gradient.
     least = torch.full((NUM_BONES, 3), -2 * math.pi)

@@ -1,0 +1,1 @@
+"""A hand laid onto pictures: what was observed, one energy, one solver."""

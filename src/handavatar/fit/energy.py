@@ -1,0 +1,334 @@
+"""The one energy of a hand laid onto a picture, linearised: what each observation says of a pose.
+
+Every term is a weighted sum of squared residuals in units of their expected error. Points of an
+outline, and colours of neighbouring points, err together: a term's weight is the number of
+independent observations it stands for, however many points it is evaluated at.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from handavatar.fit.appearance import SkinColors, see_points
+from handavatar.fit.kinematics import (
+    NUM_UNKNOWNS,
+    RestPoints,
+    Skeleton,
+    pixel_jacobian,
+    rest_with_pose,
+)
+from handavatar.fit.pictures import BlurredPicture, FramePicture
+from handavatar.fit.shape import ShapeSpace
+from handavatar.geometry.cameras import Camera
+from handavatar.geometry.meshes import SurfacePoints, vertex_normals
+from handavatar.hand.pose import HandPose
+from handavatar.hand.rig import ShapedHand
+from handavatar.render.silhouette import OutlinePoints, outline_points
+
+
+@dataclass(frozen=True)
+class EnergyOptions:
+    """What observations are expected to be off by. Pixels are those of a picture 256 wide."""
+
+    outline_error: float = 0.5
+    """Pixels between the outlines of mesh and mask in a good fit."""
+    outline_outlier: float = 1.5
+    """Pixels beyond which something else than the pose is at fault; begins eight times as wide."""
+    outline_points: float = 90.0
+    """Independent points of an outline, each way."""
+    turn_cost: float = 8.0
+    """Pixels that a point of the mask's outline goes rather than turn its normal by a radian."""
+    color_outlier: float = 3.5
+    """Standard deviations beyond which a colour has other causes."""
+    color_share: float = 0.3
+    """Independent colours per blurred pixel of the hand: what light does to them, it does to many."""
+    landmark_outlier: float = 3.0
+    """Standard deviations beyond which a landmark is misplaced."""
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkSightings:
+    """A tracker's landmarks in one frame.
+
+    Attributes:
+        pixels: of this picture.
+        errors: expected, pixels, each way.
+        depths: metres along the line of sight, relative to their mean.
+        depth_errors: expected, metres.
+    """
+
+    pixels: Float[Tensor, "21 2"]
+    errors: Float[Tensor, "21"]
+    depths: Float[Tensor, "21"]
+    depth_errors: Float[Tensor, "21"]
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """All that one frame says of its hand.
+
+    Attributes:
+        picture: colours and outline.
+        time: seconds.
+        landmarks: of a tracker, if there is one.
+    """
+
+    picture: FramePicture
+    time: float
+    landmarks: LandmarkSightings | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """A frame's energy at one place, and its slope.
+
+    Attributes:
+        hessian: Gauss and Newton's, of 51 unknowns of the pose and then the shared ones.
+        gradient: half of the energy's.
+        energy: of the outlines, the colours and the landmarks.
+    """
+
+    hessian: Float[Tensor, "unknowns unknowns"]
+    gradient: Float[Tensor, "unknowns"]
+    energy: float
+
+
+@dataclass(frozen=True, eq=False)
+class HandPoints:
+    """The hand to lay onto pictures: its shape, and points of it to compare.
+
+    Attributes:
+        hand: rest hand.
+        space: shared unknowns of its shape.
+        surface: points whose colours are compared.
+        landmarks: what a tracker's landmarks are on the rest hand; no points without a tracker.
+            Their directions are those of the shape and then of each landmark's own offset.
+    """
+
+    hand: ShapedHand
+    space: ShapeSpace
+    surface: SurfacePoints
+    landmarks: RestPoints
+
+    @property
+    def num_shared(self) -> int:
+        """Unknowns that all frames share: of the shape, and of the landmarks' offsets."""
+        return max(self.space.directions.shape[-1], self.landmarks.directions.shape[-1])
+
+
+def linearise_frame(
+    points: HandPoints,
+    pose: HandPose,
+    seen: Observation,
+    blurred: BlurredPicture,
+    colors: SkinColors | None,
+    color_error: float,
+    sigma: float,
+    outlier: float,
+    options: EnergyOptions,
+) -> Linearised:
+    """What outlines, colours and landmarks of one frame say.
+
+    Args:
+        points: the hand.
+        pose: where.
+        seen: of the frame.
+        blurred: the frame's picture.
+        colors: of the surface's points; None leaves the colours out.
+        color_error: expected error of a colour, in [0, 1].
+        sigma: of the blur, pixels.
+        outlier: pixels (of 256) at which an outline loses its pull.
+        options: expected errors.
+    """
+    hand = rest_with_pose(points.hand, pose)
+    skeleton = Skeleton.of(hand, pose, points.space.joint_directions)
+    vertices = skeleton.positions(
+        RestPoints(hand.rest_vertices, hand.rig.skin_weights, hand.rest_vertices[..., None][..., :0])
+    )
+    total = _Sum(NUM_UNKNOWNS + points.num_shared)
+    _add_outlines(total, points, hand, skeleton, vertices, seen, blurred, outlier, options)
+    if colors is not None:
+        _add_colors(
+            total, points, hand, skeleton, vertices, seen.picture, blurred, colors, color_error,
+            sigma, options,
+        )
+    if seen.landmarks is not None:
+        _add_landmarks(total, points, skeleton, seen.picture.camera, seen.landmarks, options)
+    return Linearised(total.hessian, total.gradient, total.energy)
+
+
+class _Sum:
+    """Adds up terms."""
+
+    def __init__(self, size: int) -> None:
+        self.hessian = torch.zeros(size, size)
+        self.gradient = torch.zeros(size)
+        self.energy = 0.0
+
+    def add(
+        self,
+        residuals: Float[Tensor, "residuals"],
+        jacobian: Float[Tensor, "residuals unknowns"],
+        weights: Float[Tensor, "residuals"],
+        outlier: float,
+        distances: Float[Tensor, "residuals"] | None = None,
+    ) -> None:
+        """Geman and McClure's robust sum.
+
+        Args:
+            residuals: in standard deviations.
+            jacobian: of the residuals.
+            weights: of each.
+            outlier: standard deviations.
+            distances: what tells outliers, in standard deviations; the residuals if None.
+        """
+        squared = (residuals if distances is None else distances).square() / outlier**2
+        trust = weights / (1 + squared).square()
+        self.energy += float((weights * residuals.square() / (1 + squared)).sum())
+        weighted = jacobian * trust[:, None]
+        width = jacobian.shape[1]
+        self.hessian[:width, :width] += jacobian.T @ weighted
+        self.gradient[:width] += weighted.T @ residuals
+
+
+def _add_outlines(
+    total: _Sum,
+    points: HandPoints,
+    hand: ShapedHand,
+    skeleton: Skeleton,
+    vertices: Float[Tensor, "vertices 3"],
+    seen: Observation,
+    blurred: BlurredPicture,
+    outlier: float,
+    options: EnergyOptions,
+) -> None:
+    """The mesh's outline lies on the mask's, and the mask's on the mesh's."""
+    picture = seen.picture
+    camera = picture.camera
+    unit = camera.width / 256 * options.outline_error
+    far = outlier / options.outline_error
+    outline = outline_points(vertices, hand.rig.faces, camera)
+    if len(outline.ends) == 0:
+        return
+    rest = _outline_rest(points, hand, outline)
+    positions = skeleton.positions(rest)
+    pixels, _, moving = pixel_jacobian(camera, positions)
+    values, slopes = blurred.sample(pixels)
+    is_known = picture.is_known(pixels)
+    moving = moving @ skeleton.jacobian(rest)
+    weights = outline.lengths * is_known
+    weights = weights * (options.outline_points / outline.lengths.sum())
+    jacobian = (slopes[:, 3, None] @ moving)[:, 0]
+    total.add(values[:, 3] / unit, jacobian / unit, weights, far)
+
+    border, normals = picture.border, picture.border_normals
+    if len(border) == 0:
+        return
+    facing = outline.of(vertex_normals(vertices, hand.rig.faces))
+    facing = normalize((facing @ camera.camera_from_world[:3, :3].T)[:, :2], dim=-1)
+    turn = options.turn_cost * camera.width / 256
+    tree = cKDTree(torch.cat([pixels, turn * facing], dim=1).numpy())
+    _, nearest = tree.query(torch.cat([border, turn * normals], dim=1).numpy())
+    nearest = torch.from_numpy(nearest)
+    apart = pixels[nearest] - border
+    across = (apart * normals).sum(-1)
+    jacobian = (normals[:, None] @ moving[nearest])[:, 0]
+    weights = torch.full((len(border),), options.outline_points / len(border))
+    total.add(across / unit, jacobian / unit, weights, far, apart.norm(dim=-1) / unit)
+
+
+def _outline_rest(points: HandPoints, hand: ShapedHand, outline: OutlinePoints) -> RestPoints:
+    directions = points.space.directions
+    return RestPoints(
+        outline.of(hand.rest_vertices),
+        outline.of(hand.rig.skin_weights),
+        outline.of(directions.flatten(1)).unflatten(1, directions.shape[1:]),
+    )
+
+
+def surface_rest(
+    points: HandPoints, hand: ShapedHand, index: Int[Tensor, "selected"]
+) -> RestPoints:
+    """Some points of the surface, at rest."""
+    corners = SurfacePoints(points.surface.faces[index], points.surface.barycentric[index])
+    directions = points.space.directions
+    return RestPoints(
+        corners.positions(hand.rest_vertices),
+        corners.positions(hand.rig.skin_weights),
+        corners.positions(directions.flatten(1)).unflatten(1, directions.shape[1:]),
+    )
+
+
+def _add_colors(
+    total: _Sum,
+    points: HandPoints,
+    hand: ShapedHand,
+    skeleton: Skeleton,
+    vertices: Float[Tensor, "vertices 3"],
+    picture: FramePicture,
+    blurred: BlurredPicture,
+    colors: SkinColors,
+    color_error: float,
+    sigma: float,
+    options: EnergyOptions,
+) -> None:
+    """Visible points that face the camera, inside the mask, have the colour that others saw."""
+    camera = picture.camera
+    seen = see_points(hand.rig, vertices, points.surface, camera)
+    values, slopes = blurred.sample(seen.pixels)
+    is_compared = seen.is_visible & (values[:, 3] < -1) & (colors.trust > 0.5)
+    index = (is_compared & picture.is_known(seen.pixels)).nonzero()[:, 0]
+    if len(index) < 10:
+        return
+    expected = colors.select(index).colors(seen.normals[index])
+    residuals = (values[index, :3] - expected) / color_error
+    rest = surface_rest(points, hand, index)
+    _, _, moving = pixel_jacobian(camera, skeleton.positions(rest))
+    moving = moving @ skeleton.jacobian(rest)
+    jacobian = (slopes[index, :3] @ moving / color_error).flatten(0, 1)
+    blur_area = 4 * math.pi * (sigma**2 + 0.5)
+    count = options.color_share * float(picture.hand.sum()) / blur_area
+    weights = seen.facing[index]
+    weights = weights * (count / weights.sum())
+    distance = residuals.norm(dim=-1, keepdim=True).expand(-1, 3)
+    total.add(
+        residuals.flatten(),
+        jacobian,
+        weights[:, None].expand(-1, 3).flatten(),
+        options.color_outlier,
+        distance.flatten(),
+    )
+
+
+def _add_landmarks(
+    total: _Sum,
+    points: HandPoints,
+    skeleton: Skeleton,
+    camera: Camera,
+    landmarks: LandmarkSightings,
+    options: EnergyOptions,
+) -> None:
+    """A tracker's landmarks, in the picture and in depth."""
+    rest = points.landmarks
+    skeleton = skeleton.padded(rest.directions.shape[-1])
+    positions = skeleton.positions(rest)
+    pixels, depths, moving = pixel_jacobian(camera, positions)
+    jacobian = skeleton.jacobian(rest)
+    in_picture = (moving @ jacobian) / landmarks.errors[:, None, None]
+    apart = (pixels - landmarks.pixels) / landmarks.errors[:, None]
+    distance = apart.norm(dim=-1, keepdim=True).expand(-1, 2)
+    ones = torch.ones(2 * len(apart))
+    total.add(
+        apart.flatten(), in_picture.flatten(0, 1), ones, options.landmark_outlier,
+        distance.flatten(),
+    )
+    sight = camera.camera_from_world[2, :3]
+    along = (sight @ jacobian).reshape(len(depths), -1)
+    along = (along - along.mean(0)) / landmarks.depth_errors[:, None]
+    depths = (depths - depths.mean() - landmarks.depths) / landmarks.depth_errors
+    total.add(depths, along, torch.full((len(depths),), 0.5), options.landmark_outlier)

@@ -1,0 +1,256 @@
+"""Registration: poses of all frames, and the shape, laid onto what the frames show.
+
+First the outlines decide, from wide to narrow; frames that they explain badly are begun again from
+other poses. Then the shape shares the blame, and how far the tracked poses are off is learned from
+how far they had to move. Colours come last, when the start is not spoilt, from coarse to fine.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from handavatar.fit.appearance import SkinColors, fit_colors
+from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
+from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, moved_pose, pose_difference
+from handavatar.fit.pictures import FramePicture
+from handavatar.fit.shape import ShapeSpace, fixed_shape
+from handavatar.fit.solver import Descent, Look
+from handavatar.geometry.cameras import Camera
+from handavatar.geometry.meshes import sample_surface_evenly
+from handavatar.hand.pose import HandPose
+from handavatar.hand.rig import ShapedHand
+
+Progress = Callable[[float], None]
+"""Told the share that is done, in [0, 1]."""
+
+_NUM_POINTS = 4096
+_WIDE, _MIDDLE, _NARROW = 6.0, 3.0, 1.5
+_FINE = 0.7
+"""Pixels of blur while outlines alone are looked at."""
+_BAD = 1.3
+"""Times the median energy: such frames are begun again."""
+_LEAST_COLOR_ERROR = 0.012
+_MILLIMETRES_PER_DEGREE = 0.5
+"""A tracker that is off by some degrees is off by as many half millimetres, each way."""
+_LEAST_ERROR, _MOST_ERROR = 0.5, 12.0
+"""Degrees."""
+
+
+@dataclass(frozen=True)
+class RegisterOptions:
+    """How hands are laid onto pictures."""
+
+    pose_error: float = 5.0
+    """Degrees by which a joint of a tracked pose is off, where the capture does not say."""
+    learns_pose_error: bool = True
+    """Whether this error is learned from all frames together."""
+    restarts: int = 4
+    """Times that badly explained frames are begun anew."""
+    color_sigmas: tuple[float, ...] = (3.0, 1.5)
+    """Blur of the pictures whose colours are compared, pixels of 256."""
+    color_rounds: int = 3
+    """Turns of colours and poses at each."""
+    coefficient_sigma: float = 0.5
+    """Standard deviations by which the shape coefficients may be off."""
+    seed: int = 0
+    """Of the poses to begin anew from."""
+    energy: EnergyOptions = EnergyOptions()
+    """Expected errors of what is observed."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """What a registration found.
+
+    Attributes:
+        poses: of all frames.
+        covariances: of their errors, as the energy's curvature has them: joints' turns (radians),
+            then translation (metres).
+        hand: rest hand with its shape as found.
+        energies: how badly each frame is explained; a good one has about as many as the best.
+        is_kept: frames that kept a pose found, and not the tracked one.
+        pose_error: degrees by which the tracked poses were off, as learned.
+        colors: of the surface's points, if they were looked at.
+    """
+
+    poses: HandPose
+    covariances: Float[Tensor, "frames 51 51"]
+    hand: ShapedHand
+    energies: Float[Tensor, "frames"]
+    pose_error: float
+    colors: SkinColors | None
+
+
+def observe(
+    camera: Camera,
+    color: Float[Tensor, "height width 3"],
+    coverage: Float[Tensor, "height width"],
+    known: Tensor,
+    gain: Float[Tensor, "3"],
+    time: float,
+) -> Observation:
+    """One frame's observation from its picture.
+
+    Args:
+        camera: of the picture.
+        color: sRGB in [0, 1].
+        coverage: of each pixel by the hand.
+        known: false where neither is known.
+        gain: of the channels, by the frame's exposure.
+        time: seconds.
+    """
+    return Observation(FramePicture.of(camera, color, coverage, known, gain), time)
+
+
+@torch.no_grad()
+def register(
+    hand: ShapedHand,
+    observations: Sequence[Observation],
+    tracked: HandPose,
+    information: Float[Tensor, "frames 51 51"] | None,
+    options: RegisterOptions,
+    is_sequence: bool = False,
+    learns_shape: bool = True,
+    progress: Progress | None = None,
+) -> Registered:
+    """Lays one hand onto all frames.
+
+    Args:
+        hand: rest hand to begin with.
+        observations: of the frames.
+        tracked: poses to begin with.
+        information: inverse covariances of their errors; None where nobody knows: then they are
+            learned.
+        options: expected errors, rounds.
+        is_sequence: whether the frames are neighbours in time.
+        learns_shape: whether the hand's shape moves.
+        progress: told how far it is.
+    """
+    report = progress or (lambda share: None)
+    rig = hand.rig
+    space = (
+        ShapeSpace.around(rig, options.coefficient_sigma) if learns_shape else fixed_shape(rig)
+    )
+    generator = torch.Generator().manual_seed(options.seed)
+    surface = sample_surface_evenly(rig.template_vertices, rig.faces, _NUM_POINTS, generator)
+    none = RestPoints(torch.zeros(0, 3), torch.zeros(0, 16), torch.zeros(0, 3, 0))
+
+    def points_of(shared: Float[Tensor, "shared"], frame: int) -> HandPoints:
+        return HandPoints(space.shaped(hand, shared), space, surface, none)
+
+    error = options.pose_error
+    is_learned = information is None and options.learns_pose_error
+    if information is None:
+        information = _information(error, len(observations))
+    descent = Descent(
+        observations=list(observations),
+        times=torch.tensor([seen.time for seen in observations]),
+        tracked=tracked,
+        information=information,
+        points_of=points_of,
+        shared_sigmas=space.sigmas,
+        options=options.energy,
+        is_sequence=is_sequence,
+        poses=tracked,
+        shared=torch.zeros(len(space.sigmas)),
+    )
+    for outlier in (_WIDE, _MIDDLE):
+        descent.step_poses(Look(_FINE, outlier), 4)
+    report(0.15)
+    descent.step_shape(Look(_FINE, _MIDDLE), 4)
+    report(0.2)
+    for turn in range(options.restarts):
+        begin_anew(descent, Look(_FINE, _NARROW), generator, is_near=turn % 2 == 1)
+    report(0.45)
+    descent.step_shape(Look(_FINE, _NARROW), 4)
+    if is_learned:
+        for _ in range(3):
+            error = _learned_error(descent, Look(_FINE, _NARROW), error)
+            descent.information = _information(error, len(observations))
+            descent.damping.fill_(1e-2)
+            descent.step_shape(Look(_FINE, _NARROW), 2)
+            descent.step_poses(Look(_FINE, _NARROW), 2)
+    report(0.55)
+    look, colors = Look(_FINE, _NARROW), None
+    width = observations[0].picture.camera.width / 256
+    for number, sigma in enumerate(options.color_sigmas):
+        for turn in range(options.color_rounds):
+            look = colored_look(descent, sigma * width)
+            colors = look.colors
+            descent.step_poses(look, 2)
+            done = number + (turn + 1) / options.color_rounds
+            report(0.55 + 0.45 * done / len(options.color_sigmas))
+    return Registered(
+        descent.poses,
+        descent.covariances(look),
+        points_of(descent.shared, 0).hand,
+        descent.energies(look),
+        error,
+        colors,
+    )
+
+
+def colored_look(descent: Descent, sigma: float) -> Look:
+    """A look at colours, as all frames together show them at present."""
+    look = Look(sigma, _NARROW)
+    num_points = len(descent.points_of(descent.shared, 0).surface.faces)
+    colors, error = fit_colors(descent.see(look), num_points)
+    return replace(look, colors=colors, color_error=max(error, _LEAST_COLOR_ERROR))
+
+
+def begin_anew(
+    descent: Descent, look: Look, generator: torch.Generator, is_near: bool
+) -> None:
+    """Tries badly explained frames from other poses, and keeps what explains them better.
+
+    Args:
+        descent: of all frames.
+        look: by which frames are judged.
+        generator: of the other poses.
+        is_near: whether to begin around what was found, instead of around what was tracked.
+    """
+    descent.step_poses(look, 4)
+    before = descent.energies(look)
+    bad = (before > _BAD * before.median()).nonzero()[:, 0]
+    if len(bad) == 0:
+        return
+    part = descent.select(bad)
+    around = part.poses if is_near else part.tracked
+    spread = part.information.diagonal(dim1=-2, dim2=-1).rsqrt()
+    change = torch.randn(len(bad), NUM_UNKNOWNS, generator=generator) * spread
+    part.poses = moved_pose(around, change)
+    for outlier in (_WIDE, _MIDDLE, look.outlier):
+        part.step_poses(replace(look, outlier=outlier), 4)
+    is_better = part.energies(look) < before[bad]
+    chosen = bad[is_better]
+    rotations, translation = descent.poses.rotations.clone(), descent.poses.translation.clone()
+    rotations[chosen] = part.poses.rotations[is_better]
+    translation[chosen] = part.poses.translation[is_better]
+    descent.poses = HandPose(rotations, translation)
+    descent.damping[chosen] = 1e-2
+
+
+def _information(degrees: float, count: int) -> Float[Tensor, "count 51 51"]:
+    """Of poses whose every joint is off by so many degrees, root mean square."""
+    turn = torch.deg2rad(torch.tensor(degrees)) / 3**0.5
+    shift = 1e-3 * _MILLIMETRES_PER_DEGREE * degrees
+    sigma = torch.cat([turn.expand(NUM_UNKNOWNS - 3), torch.full((3,), shift)])
+    return torch.diag(sigma**-2).expand(count, -1, -1)
+
+
+def _learned_error(descent: Descent, look: Look, error: float) -> float:
+    """How far tracked poses are off: by how far they moved, and how unsure that still is.
+
+    One step of expectation and maximisation for a single variance, of all frames that are well
+    explained.
+    """
+    energies = descent.energies(look)
+    is_good = energies < _BAD * energies.median()
+    moved = pose_difference(descent.tracked, descent.poses)[is_good, :-3]
+    variances = descent.covariances(look).diagonal(dim1=-2, dim2=-1)[is_good, :-3]
+    mean = (moved.square() + variances).mean()
+    found = float(torch.rad2deg((3 * mean).sqrt()))
+    return min(max(found, _LEAST_ERROR), _MOST_ERROR)

@@ -1,0 +1,297 @@
+"""Levenberg and Marquardt's descent of the one energy: poses frame by frame, shape for all at once.
+
+Each frame has its own damping, and keeps its pose where a step does not lower its energy. A step
+of the shape moves all poses with it (Schur complement), and is taken back as a whole.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from handavatar.field.threads import mapped
+from handavatar.fit.appearance import SeenColors, SkinColors, see_colors
+from handavatar.fit.energy import (
+    EnergyOptions,
+    HandPoints,
+    Linearised,
+    Observation,
+    linearise_frame,
+)
+from handavatar.fit.habits import habit_residuals
+from handavatar.fit.kinematics import NUM_UNKNOWNS, moved_pose, pose_difference
+from handavatar.fit.motion import MotionTerms, motion_terms, solve_chain
+from handavatar.fit.pictures import BlurredPicture
+from handavatar.hand.pose import HandPose
+from handavatar.hand.rig import ShapedHand
+
+_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e4
+_LONGEST_TURN = 0.35
+"""Radians of one step."""
+_FURTHER, _BACK = 0.25, 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """How frames are looked at in one stage.
+
+    Attributes:
+        sigma: blur of the pictures, pixels.
+        outlier: at which an outline loses its pull, pixels of 256.
+        colors: to compare with; None leaves colours out.
+        color_error: expected, of a channel in [0, 1].
+    """
+
+    sigma: float
+    outlier: float
+    colors: SkinColors | None = None
+    color_error: float = 1.0
+
+
+@dataclass(eq=False)
+class Descent:
+    """The unknowns of a fit, and where they are now.
+
+    Attributes:
+        observations: frame by frame.
+        times: of the frames, seconds; successive ones keep each other even.
+        tracked: poses to stay near.
+        information: how near, the inverse covariance of each tracked pose's errors.
+        base: the rest hand to start from.
+        points_of: the hand for given shared unknowns.
+        shared_sigmas: expected size of the shared unknowns.
+        options: expected errors.
+        is_sequence: whether the frames follow each other in time.
+        poses: as found so far.
+        shared: unknowns that all frames share: shape, offsets of landmarks.
+    """
+
+    observations: list[Observation]
+    times: Float[Tensor, "frames"]
+    tracked: HandPose
+    information: Float[Tensor, "frames 51 51"]
+    points_of: Callable[[Float[Tensor, "shared"], int], HandPoints]
+    shared_sigmas: Float[Tensor, "shared"]
+    options: EnergyOptions
+    is_sequence: bool
+    poses: HandPose
+    shared: Float[Tensor, "shared"]
+    damping: Float[Tensor, "frames"] = field(init=False)
+    shared_damping: float = 1e-2
+    _blurred: dict[tuple[int, float], BlurredPicture] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Begins with little damping."""
+        self.damping = torch.full((len(self.observations),), _DAMPING)
+
+    def select(self, frames: Int[Tensor, "selected"]) -> "Descent":
+        """A descent of some frames, each for itself; they may repeat."""
+        numbers = frames.tolist()
+        selected = replace(
+            self,
+            observations=[self.observations[number] for number in numbers],
+            times=self.times[frames],
+            tracked=_at(self.tracked, frames),
+            information=self.information[frames],
+            is_sequence=False,
+            poses=_at(self.poses, frames),
+            points_of=lambda shared, place: self.points_of(shared, numbers[place]),
+        )
+        selected._blurred = {}
+        for place, number in enumerate(numbers):
+            for (frame, sigma), picture in self._blurred.items():
+                if frame == number:
+                    selected._blurred[place, sigma] = picture
+        return selected
+
+    def blurred(self, frame: int, sigma: float) -> BlurredPicture:
+        """A frame's picture, blurred; kept."""
+        key = (frame, sigma)
+        if key not in self._blurred:
+            self._blurred[key] = self.observations[frame].picture.blurred(sigma)
+        return self._blurred[key]
+
+    def forget_blurred(self, sigma: float) -> None:
+        """Frees the pictures of one blur."""
+        self._blurred = {key: value for key, value in self._blurred.items() if key[1] != sigma}
+
+    def see(self, look: Look) -> list[SeenColors]:
+        """The colours that every frame shows, with the poses as they are."""
+
+        def seen(frame: int) -> SeenColors:
+            points = self.points_of(self.shared, frame)
+            vertices = points.hand.posed(_at(self.poses, frame)).vertices
+            picture = self.observations[frame].picture
+            blurred = self.blurred(frame, look.sigma)
+            return see_colors(points.hand.rig, vertices, points.surface, picture, blurred)
+
+        return mapped(seen, range(len(self.observations)))
+
+    def energies(self, look: Look) -> Float[Tensor, "frames"]:
+        """Of each frame, priors included."""
+        return self._linearised(look, self.poses, self.shared).energies
+
+    def covariances(self, look: Look) -> Float[Tensor, "frames 51 51"]:
+        """Of each pose's errors, as the curvature of its energy says; neighbours held still."""
+        here = self._linearised(look, self.poses, self.shared)
+        return torch.linalg.inv(here.pose_blocks().double()).float()
+
+    def step_poses(self, look: Look, steps: int) -> None:
+        """Descends in the poses; every frame keeps what is best for it."""
+        here = self._linearised(look, self.poses, self.shared)
+        for _ in range(steps):
+            change = here.solve(self.damping)
+            candidate = moved_pose(self.poses, change)
+            there = self._linearised(look, candidate, self.shared)
+            is_better = there.energies < here.energies
+            self._damp(is_better)
+            self.poses = _merged(is_better, candidate, self.poses)
+            if bool(is_better.all()):
+                here = there
+            else:
+                here = here.merged(is_better, there)
+                if self.is_sequence:
+                    here = replace(here, motion=motion_terms(self.poses, self.times))
+
+    def step_shape(self, look: Look, steps: int) -> None:
+        """Descends in shape and poses together; taken back unless the whole energy falls."""
+        if len(self.shared) == 0:
+            self.step_poses(look, steps)
+            return
+        here = self._linearised(look, self.poses, self.shared)
+        for _ in range(steps):
+            change, shared_change = here.solve_shared(
+                self.damping, self.shared, self.shared_sigmas, self.shared_damping
+            )
+            candidate = moved_pose(self.poses, change)
+            shared = self.shared + shared_change
+            there = self._linearised(look, candidate, shared)
+            prior = (self.shared / self.shared_sigmas).square().sum()
+            new_prior = (shared / self.shared_sigmas).square().sum()
+            if there.energies.sum() + new_prior < here.energies.sum() + prior:
+                self.poses, self.shared, here = candidate, shared, there
+                self.shared_damping = max(self.shared_damping * _FURTHER, _LEAST_DAMPING)
+            else:
+                self.shared_damping *= _BACK
+                self.damping = (self.damping * _BACK).clamp_max(_MOST_DAMPING)
+
+    def _damp(self, is_better: Bool[Tensor, "frames"]) -> None:
+        factor = torch.where(is_better, _FURTHER, _BACK)
+        self.damping = (self.damping * factor).clamp(_LEAST_DAMPING, _MOST_DAMPING)
+
+    def _linearised(
+        self, look: Look, poses: HandPose, shared: Float[Tensor, "shared"]
+    ) -> "_Whole":
+        def linearised(frame: int) -> Linearised:
+            return linearise_frame(
+                self.points_of(shared, frame),
+                _at(poses, frame),
+                self.observations[frame],
+                self.blurred(frame, look.sigma),
+                look.colors,
+                look.color_error,
+                look.sigma,
+                look.outlier,
+                self.options,
+            )
+
+        parts = mapped(linearised, range(len(self.observations)))
+        hessian = torch.stack([part.hessian for part in parts])
+        gradient = torch.stack([part.gradient for part in parts])
+        energies = torch.tensor([part.energy for part in parts])
+        rig = self.points_of(shared, 0).hand.rig
+        residuals, jacobian = habit_residuals(rig, poses.rotations)
+        energies += residuals.square().sum(-1)
+        jacobian = torch.nn.functional.pad(jacobian, (0, 3))
+        hessian[:, :NUM_UNKNOWNS, :NUM_UNKNOWNS] += jacobian.mT @ jacobian + self.information
+        away = pose_difference(self.tracked, poses)
+        pull = (self.information @ away[..., None])[..., 0]
+        gradient[:, :NUM_UNKNOWNS] += (jacobian.mT @ residuals[..., None])[..., 0] + pull
+        energies += (away * pull).sum(-1)
+        motion = motion_terms(poses, self.times if self.is_sequence else self.times[:0])
+        return _Whole(hessian, gradient, energies, motion)
+
+
+@dataclass(frozen=True, eq=False)
+class _Whole:
+    """All frames, linearised."""
+
+    hessian: Float[Tensor, "frames unknowns unknowns"]
+    gradient: Float[Tensor, "frames unknowns"]
+    own_energies: Float[Tensor, "frames"]
+    motion: MotionTerms
+
+    @property
+    def energies(self) -> Float[Tensor, "frames"]:
+        return self.own_energies + self.motion.frame_energy(len(self.own_energies))
+
+    def pose_blocks(self) -> Float[Tensor, "frames 51 51"]:
+        """Each frame's own matrix with its neighbours held still."""
+        blocks = self.hessian[:, :NUM_UNKNOWNS, :NUM_UNKNOWNS].clone()
+        diagonal = torch.zeros(len(blocks), NUM_UNKNOWNS)
+        for offset in range(3):
+            weights = self.motion.weights[:, offset].square()
+            diagonal.index_add_(0, self.motion.first + offset, weights)
+        return blocks + torch.diag_embed(diagonal)
+
+    def merged(self, is_other: Bool[Tensor, "frames"], other: "_Whole") -> "_Whole":
+        """Some frames of another."""
+        return _Whole(
+            torch.where(is_other[:, None, None], other.hessian, self.hessian),
+            torch.where(is_other[:, None], other.gradient, self.gradient),
+            torch.where(is_other, other.own_energies, self.own_energies),
+            self.motion,
+        )
+
+    def _damped(self, damping: Float[Tensor, "frames"]) -> Float[Tensor, "frames 51 51"]:
+        blocks = self.hessian[:, :NUM_UNKNOWNS, :NUM_UNKNOWNS]
+        diagonal = blocks.diagonal(dim1=-2, dim2=-1)
+        return blocks + torch.diag_embed(damping[:, None] * diagonal)
+
+    def solve(self, damping: Float[Tensor, "frames"]) -> Float[Tensor, "frames 51"]:
+        """The step of all poses, the shape held still."""
+        gradient = self.gradient[:, :NUM_UNKNOWNS] + self.motion.gradient(len(damping))
+        step = -solve_chain(self._damped(damping), self.motion, gradient[..., None])[..., 0]
+        return _bounded(step)
+
+    def solve_shared(
+        self,
+        damping: Float[Tensor, "frames"],
+        shared: Float[Tensor, "shared"],
+        sigmas: Float[Tensor, "shared"],
+        shared_damping: float,
+    ) -> tuple[Float[Tensor, "frames 51"], Float[Tensor, "shared"]]:
+        """The step of poses and shared unknowns together."""
+        poses = slice(NUM_UNKNOWNS)
+        others = slice(NUM_UNKNOWNS, None)
+        gradient = self.gradient[:, poses] + self.motion.gradient(len(damping))
+        mixed = self.hessian[:, poses, others]
+        right = torch.cat([gradient[..., None], mixed], dim=-1)
+        solved = solve_chain(self._damped(damping), self.motion, right)
+        own, along = solved[..., 0], solved[..., 1:]
+        curvature = self.hessian[:, others, others].sum(0) + torch.diag(sigmas**-2)
+        slope = self.gradient[:, others].sum(0) + shared / sigmas**2
+        reduced = curvature - torch.einsum("fps,fpt->st", mixed, along)
+        slope = slope - torch.einsum("fps,fp->s", mixed, own)
+        reduced = reduced + shared_damping * torch.diag(curvature.diagonal())
+        change = -torch.linalg.solve(reduced.double(), slope.double()).float()
+        return _bounded(-own - along @ change), change
+
+
+def _bounded(step: Float[Tensor, "frames 51"]) -> Float[Tensor, "frames 51"]:
+    """The step, shortened where it turns a joint too far."""
+    longest = step[:, :-3].abs().amax(-1, keepdim=True)
+    return step * (_LONGEST_TURN / longest.clamp_min(_LONGEST_TURN))
+
+
+def _at(poses: HandPose, frames: Int[Tensor, "selected"] | int) -> HandPose:
+    return HandPose(poses.rotations[frames], poses.translation[frames])
+
+
+def _merged(is_first: Bool[Tensor, "frames"], first: HandPose, second: HandPose) -> HandPose:
+    return HandPose(
+        torch.where(is_first[:, None, None], first.rotations, second.rotations),
+        torch.where(is_first[:, None], first.translation, second.translation),
+    )
