@@ -14,6 +14,7 @@ from handavatar.capture.benchmark import (
 )
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.frames import find_problems, read_capture
+from handavatar.jobs.files import MARKER
 
 
 def test_names_say_subject_lighting_transport_and_what_is_worse() -> None:
