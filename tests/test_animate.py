@@ -2,6 +2,7 @@
 
 import copy
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from conftest import bent_pose, camera_above
 from PIL import Image
 from two_processes import ended, two_begun
 
+from handavatar import cli
 from handavatar.animate import (
     PASSES,
     RenderOptions,
@@ -29,6 +31,8 @@ from handavatar.capture.frames import CaptureError
 from handavatar.capture.motion import gesture
 from handavatar.geometry.cameras import project
 from handavatar.hand.pose import HandPose
+from handavatar.jobs.files import MARKER, FolderInUse
+from handavatar.train.runs import create_run
 
 SIZE = 16
 
@@ -78,7 +82,8 @@ def test_a_motion_becomes_pictures_and_a_video_that_plays(
     passes = ",".join(PASSES)
     options = replace(_options(avatar_file, motion_file, out, frames=3), passes=passes)
     assert render_motion(options) == out
-    assert {path.name for path in out.iterdir()} == {*PASSES, *(f"{name}.mp4" for name in PASSES)}
+    names = {*PASSES, *(f"{name}.mp4" for name in PASSES), MARKER}
+    assert {path.name for path in out.iterdir()} == names
     for name in PASSES:
         files = sorted((out / name).iterdir())
         assert [file.name for file in files] == ["000000.png", "000001.png", "000002.png"]
@@ -114,11 +119,68 @@ def test_a_folder_that_is_not_empty_is_refused_unless_told(
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "precious.txt").write_text("mine")
     options = _options(avatar_file, motion_file, tmp_path / "out", frames=1)
-    with pytest.raises(ValueError, match="not empty"):
+    with pytest.raises(FolderInUse, match="not empty"):
         render_motion(options)
+    with pytest.raises(FolderInUse, match="holds no pictures of this program's making"):
+        render_motion(replace(options, overwrite=True))
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["precious.txt"]
-    render_motion(replace(options, overwrite=True))
-    assert (tmp_path / "out" / "rgb.mp4").is_file()
+    assert (tmp_path / "out" / "precious.txt").read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_pictures_are_replaced_when_told_but_not_with_a_file_that_is_not_theirs(
+    avatar_file: Path, motion_file: Path, tmp_path: Path
+) -> None:
+    options = _options(avatar_file, motion_file, tmp_path / "out", frames=1)
+    bright = replace(options, light_gain=1.5, overwrite=True)
+    dark = _contents(render_motion(options))
+    with pytest.raises(FolderInUse, match="not empty"):
+        render_motion(replace(bright, overwrite=False))
+    assert _contents(options.out) == dark
+    (options.out / "rgb" / "notes.txt").write_text("mine")
+    with pytest.raises(FolderInUse, match=r"holds rgb/notes\.txt, not written by this program"):
+        render_motion(bright)
+    assert (options.out / "rgb" / "notes.txt").read_text() == "mine"
+    (options.out / "rgb" / "notes.txt").unlink()
+    assert _contents(options.out) == dark
+    assert _contents(render_motion(bright)) != dark
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_run_is_not_replaced_by_its_pictures(
+    avatar_file: Path, motion_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = create_run(
+        tmp_path / "run", {}, seed=1, capture=tmp_path, capture_sha256="", perceptual="x"
+    ).folder
+    shutil.copyfile(avatar_file, run / "avatar.safetensors")
+    before = _contents(run)
+    words = ["render", str(run), "--motion", str(motion_file), "--out", str(run), "--overwrite"]
+    assert cli.main(words) == 2
+    assert f"{run} is what is read: {run}" in capsys.readouterr().err
+    words[1] = str(run / "avatar.safetensors")
+    assert cli.main(words) == 2
+    assert f"{run} holds what is read: {run}" in capsys.readouterr().err
+    words[1] = str(avatar_file)
+    assert cli.main(words) == 2
+    assert "is marked as run, not as pictures" in capsys.readouterr().err
+    (run / MARKER).unlink()
+    assert cli.main(words) == 2
+    assert "name another folder" in capsys.readouterr().err
+    assert _contents(run) == before and not list(tmp_path.glob("*.unfinished"))
+
+
+def test_another_ones_unfinished_folder_stays(
+    avatar_file: Path, motion_file: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "K.unfinished"
+    other.mkdir()
+    (other / "f").write_text("hi")
+    options = _options(avatar_file, motion_file, tmp_path / "K", frames=1)
+    for overwrite in (False, True):
+        with pytest.raises(FolderInUse, match=r"K\.unfinished is in the way"):
+            render_motion(replace(options, overwrite=overwrite))
+    assert (other / "f").read_text() == "hi" and not options.out.exists()
 
 
 def test_a_failure_on_the_way_leaves_nothing(
@@ -232,7 +294,8 @@ def test_what_coarse_samples_miss_is_found_out(small_avatar: HandAvatar) -> None
 
 
 def _contents(folder: Path) -> dict[str, bytes]:
-    files = (path for path in folder.rglob("*") if path.is_file())
+    """Of the files but for the marker, which says when it was written."""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name != MARKER)
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 

@@ -30,7 +30,7 @@ def test_the_demonstration_leaves_everything_it_promises(
     out = run_demo(DemoOptions(tmp_path / "out", steps=4, frames=2, size=32, device="cpu"))
     names = {path.name for path in out.iterdir()}
     promised = {"avatar.safetensors", "metrics.json", "report.html", "novel_poses.mp4"}
-    assert names == promised | {"edits.png", "overview.png", "run"}
+    assert names == promised | {"edits.png", "overview.png", "run", ".handavatar"}
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["mask_iou"] > 0.7 and metrics["truth"] is not None
     with av.open(str(out / "novel_poses.mp4")) as container:
@@ -42,5 +42,11 @@ def test_the_demonstration_leaves_everything_it_promises(
     # Told again, it continues: nothing is left to train.
     monkeypatch.setattr(demo, "edited_pictures", lambda _: np.zeros((4, 4, 3), np.uint8))
     before = (out / "avatar.safetensors").read_bytes()
+    # What somebody has put there meanwhile stays.
+    notes = out / "notes.txt", out / "run" / "renders" / "novel_poses" / "rgb" / "notes.txt"
+    for path in notes:
+        path.write_text("mine")
     run_demo(DemoOptions(out, steps=4, frames=2, size=32, device="cpu"))
     assert (out / "avatar.safetensors").read_bytes() == before
+    assert [path.read_text() for path in notes] == ["mine", "mine"]
+    assert (out / "run" / "renders" / "novel_poses-2" / "rgb.mp4").is_file()

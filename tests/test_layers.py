@@ -7,43 +7,48 @@ from source_tree import imported_modules, modules
 
 # Left: a folder or top module. Right: what it may import besides itself.
 EVERYTHING_BELOW = (
-    "geometry hand capture field render edit replay avatar plain retouch processes unfinished "
+    "geometry jobs hand fit capture field render edit replay avatar plain retouch processes "
     "alignment animate evaluate train peers export view demo doctor"
 )
 MAY_IMPORT = {
     name: set(allowed.split())
     for name, allowed in {
         "geometry": "",
+        # Files and folders of a long command; knows no hand.
+        "jobs": "",
         "hand": "geometry",
         "render": "geometry",
-        "capture": "geometry hand render",
-        "field": "geometry hand",
+        # A hand laid onto pictures.
+        "fit": "geometry jobs hand render",
+        "capture": "geometry jobs hand render fit",
+        "field": "geometry jobs hand",
         "edit": "hand field",
         # A function's work on a GPU, recorded.
         "replay": "",
-        "avatar": "geometry hand field render edit replay",
+        "avatar": "geometry jobs hand field render edit replay",
         # Fits a pose to a mask with any shaped hand.
         "alignment": "geometry hand render",
         # The slow renderer that the fast one is measured against.
         "plain": "geometry field render avatar",
-        "evaluate": "geometry hand capture edit avatar alignment plain",
-        "train": "geometry hand capture field render avatar plain alignment evaluate processes",
+        "evaluate": "geometry jobs hand fit capture edit avatar alignment plain",
+        "train": (
+            "geometry jobs hand fit capture field render avatar plain alignment evaluate processes"
+        ),
         # Prior art, for a table alone.
-        "peers": "geometry hand capture field render avatar evaluate train",
+        "peers": "geometry jobs hand fit capture field render avatar evaluate train",
         # A texture's chart is rasterised; words of an edit mean what they mean elsewhere.
-        "export": "geometry hand capture field render edit avatar retouch unfinished",
+        "export": "geometry hand capture field render edit avatar retouch jobs",
         # Its fluid pictures bake the fields on the mesh; its others are what `animate` makes. What
         # a trainer leaves for others to see is read where it is written.
-        "view": "geometry hand capture field render edit avatar retouch animate train",
+        "view": "geometry jobs hand capture field render edit avatar retouch animate train",
         # What words and pictures mean to an avatar.
         "retouch": "hand capture edit avatar",
         "processes": "",
-        "unfinished": "",
         # Motions to pictures: what a viewer may see, the rasteriser's neighbours, and the kernels'
         # names.
-        "animate": "geometry hand capture field render edit avatar retouch processes unfinished",
+        "animate": "geometry hand capture field render edit avatar retouch processes jobs",
         # The whole road in one call, just under the command line.
-        "demo": "geometry hand capture field render edit avatar animate evaluate train",
+        "demo": "geometry jobs hand fit capture field render edit avatar animate evaluate train",
         "doctor": "hand capture field evaluate train",
         "cli": EVERYTHING_BELOW,
         "__main__": "cli",

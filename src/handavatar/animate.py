@@ -30,11 +30,22 @@ from handavatar.geometry.cameras import Camera
 from handavatar.geometry.colors import eight_bits
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
+from handavatar.jobs.files import FolderKind, UnfinishedFolder, files_named, refuse_folder_in_use
 from handavatar.processes import joined_processes
 from handavatar.retouch import Look
-from handavatar.unfinished import UnfinishedFolder
 
 PASSES = ("rgb", "albedo", "illumination", "normal", "depth", "alpha")
+_NUMBER = "[0-9]" * 6
+PICTURES = FolderKind(
+    "pictures",
+    (
+        *(f"{name}/{_NUMBER}.png" for name in PASSES),
+        *(f"{name}.mp4" for name in PASSES),
+        f"errors/{_NUMBER}.json",
+        "errors.json",
+    ),
+)
+"""The folder that :func:`render_motion` makes."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +66,8 @@ class RenderOptions(Look):
             weighs 1e-7, and takes some three times as long.
         check: of every frame so many pixels are evaluated exactly as well, and ``errors.json``
             states how far they are from the picture.
-        overwrite: replace what lies at ``out``.
+        overwrite: replace pictures that lie at ``out``; never a folder that this program did not
+            write, one of another kind, or one with other files in it.
         device: where the fields run.
         kernel: what decodes pairs of parts; ``triton`` is for NVIDIA GPUs, with ``-tf32`` or
             ``-bf16`` for products of shorter numbers.
@@ -87,7 +99,8 @@ def render_motion(options: RenderOptions) -> Path:
     Raises:
         CheckpointError: if the avatar cannot be read.
         CaptureError: if the motion cannot be read.
-        ValueError: for a pass or an edit that does not exist, or a folder that is not empty.
+        ValueError: for a pass or an edit that does not exist.
+        FolderInUse: if ``out`` holds something that may not be replaced.
     """
     for flag, value, least in (
         ("--size", options.size, 2),
@@ -106,6 +119,8 @@ def render_motion(options: RenderOptions) -> Path:
                 f"--passes: there is no pass '{name}'; choose from {', '.join(PASSES)}"
             )
     options.check_look()
+    inputs = [options.run, *files_named(options.motion, options.paint)]
+    refuse_folder_in_use(options.out, PICTURES, options.overwrite, inputs)
     device = str(chosen_device(options.device))
     kernel = chosen_kernel(options.kernel, device)
     avatar = HandAvatar.load(options.run)
@@ -122,7 +137,7 @@ def render_motion(options: RenderOptions) -> Path:
     settings = EXACT if options.quality == "exact" else RenderSettings()
     settings = replace(settings, num_samples=options.num_samples, kernel=kernel)
     facts = _what_frames_depend_on(avatar, edit, options, poses, views)
-    folder = UnfinishedFolder(options.out, facts)
+    folder = UnfinishedFolder(options.out, PICTURES, facts, inputs)
     with joined_processes(device) as processes:
         avatar.moved_to(processes.device)
         try:

@@ -33,7 +33,7 @@ from handavatar.field.shading import (
     directed_occupancy,
 )
 from handavatar.field.shape import ShapeOffsets, personal_hand
-from handavatar.field.threads import mapped
+from handavatar.jobs.threads import mapped
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
 from handavatar.hand.parts import finer_rig

@@ -5,18 +5,30 @@ import shutil
 import sys
 import time
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from PIL import Image
 
-from handavatar.animate import RenderOptions, pass_pictures, render_motion
+from handavatar.animate import PICTURES, RenderOptions, pass_pictures, render_motion
 from handavatar.avatar import HandAvatar
 from handavatar.capture.default import default_capture
 from handavatar.edit import Edit, bones_named
 from handavatar.evaluate.run import EvaluateOptions, evaluate_run
+from handavatar.jobs.files import FolderInUse, FolderKind, claim_folder, refuse_folder_in_use
 from handavatar.train.loop import TrainOptions, train
+from handavatar.train.runs import RUN
+
+
+def _is_older_demo(folder: Path) -> bool:
+    """Whether a version that left no marker has begun a demonstration there."""
+    return RUN.is_older(folder / "run")
+
+
+DEMONSTRATION = FolderKind("demonstration", is_older=_is_older_demo)
+"""The folder that :func:`run_demo` writes into."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +60,13 @@ def run_demo(options: DemoOptions) -> Path:
 
     Returns:
         The folder.
+
+    Raises:
+        FolderInUse: if ``out`` holds something that is no demonstration.
     """
     out = options.out
     run = out / "run"
-    if out.exists() and any(out.iterdir()) and not (run / "run.json").is_file():
-        raise ValueError(f"--out {out}: not empty and no demonstration; name another folder")
-    out.mkdir(parents=True, exist_ok=True)
+    claim_folder(out, DEMONSTRATION)
     begin = time.monotonic()
     _say("1/4 training on the shipped capture", begin)
     train(
@@ -72,7 +85,7 @@ def run_demo(options: DemoOptions) -> Path:
     shutil.copyfile(run / "evaluation" / "report.html", out / "report.html")
     Image.fromarray(overview(run / "evaluation")).save(out / "overview.png")
     _say("3/4 a video of poses it never saw", begin)
-    renders = run / "renders" / "novel_poses"
+    renders = _folder_of_pictures(run / "renders")
     render_motion(
         RenderOptions(
             run=run,
@@ -94,6 +107,18 @@ def run_demo(options: DemoOptions) -> Path:
         begin,
     )
     return out
+
+
+def _folder_of_pictures(renders: Path) -> Path:
+    """``novel_poses``, or the first name with a number that holds nothing of anybody else's."""
+    for number in count(1):
+        folder = renders / ("novel_poses" if number == 1 else f"novel_poses-{number}")
+        try:
+            refuse_folder_in_use(folder, PICTURES, overwrite=True)
+        except FolderInUse:
+            continue
+        return folder
+    raise AssertionError("there is always a number that is free")
 
 
 def overview(evaluation: Path, count: int = 4) -> np.ndarray:

@@ -14,6 +14,7 @@ from handavatar.capture.benchmark import (
 )
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.frames import find_problems, read_capture
+from handavatar.jobs.files import MARKER
 
 
 def test_names_say_subject_lighting_transport_and_what_is_worse() -> None:
@@ -54,7 +55,8 @@ def tiny_size(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _contents(folder: Path) -> dict[str, bytes]:
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    """Of the files but for the marker, which says when it was written."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name != MARKER)
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 

@@ -24,6 +24,7 @@ from handavatar.capture.frames import (
 from handavatar.geometry.cameras import Camera, look_at, project
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
+from handavatar.jobs.files import MARKER
 
 HEADER = dict(
     rig_name="open-hand",
@@ -280,6 +281,46 @@ def test_a_folder_in_use_is_refused(folder, tmp_path):
     with pytest.raises(CaptureError, match="no capture"):
         write_capture(tmp_path / "precious", [make_frame(0)], overwrite=True, **HEADER)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["made", "precious"]
+
+
+def test_a_scene_of_nerfstudio_is_not_taken_for_a_capture(tmp_path):
+    scene = tmp_path / "N"
+    scene.mkdir()
+    (scene / "notes").write_text("hi")
+    for text in ("{}", '{"handavatar": null}', "[" * 100_000, "no JSON"):
+        (scene / "transforms.json").write_text(text)
+        with pytest.raises(CaptureError, match="holds no capture of this program's making"):
+            write_capture(scene, [make_frame(0)], overwrite=True, **HEADER)
+        assert (scene / "transforms.json").read_text() == text
+    assert (scene / "notes").read_text() == "hi" and list(tmp_path.iterdir()) == [scene]
+
+
+@pytest.mark.parametrize("is_older", [False, True])
+def test_a_capture_with_a_file_of_somebody_elses_is_not_replaced(folder, is_older):
+    if is_older:
+        (folder / MARKER).unlink()
+    (folder / "truth").mkdir()
+    (folder / "images/beach.jpg").write_text("dear")
+    with pytest.raises(CaptureError, match=r"holds images/beach\.jpg, not written by"):
+        write_capture(folder, [make_frame(0)], overwrite=True, **HEADER)
+    assert (folder / "images/beach.jpg").read_text() == "dear"
+    assert len(read_capture(folder).records) == 3
+    (folder / "images/beach.jpg").unlink()
+    write_capture(folder, [make_frame(0)], overwrite=True, **HEADER)
+    assert len(read_capture(folder).records) == 1
+
+
+def test_a_capture_is_not_written_over_what_it_is_made_from(folder):
+    with pytest.raises(CaptureError, match="what is read"):
+        CaptureWriter(folder, overwrite=True, inputs=(folder / "images/000000.png",), **HEADER)
+
+
+def test_a_link_is_not_replaced(folder, tmp_path):
+    link = tmp_path / "link"
+    link.symlink_to(folder)
+    with pytest.raises(CaptureError, match="is a link"):
+        write_capture(link, [make_frame(0)], overwrite=True, **HEADER)
+    assert link.is_symlink() and len(read_capture(folder).records) == 3
 
 
 def test_nothing_half_written_stays(tmp_path):

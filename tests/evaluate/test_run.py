@@ -18,6 +18,7 @@ from handavatar.capture.frames import CaptureError, read_capture
 from handavatar.evaluate import run as run_module
 from handavatar.evaluate.run import EvaluateOptions, evaluate_run
 from handavatar.hand.pose import HandPose
+from handavatar.jobs.files import FolderInUse
 
 KEYS = {
     "split",
@@ -84,6 +85,7 @@ def test_what_was_not_measured_is_null_with_a_reason(judged: tuple[dict[str, Any
 def test_pictures_and_report_are_written(judged: tuple[dict[str, Any], Path]) -> None:
     _, out = judged
     assert {path.name for path in out.iterdir()} == {
+        ".handavatar",
         "000003.png",
         "000004.png",
         "metrics.json",
@@ -93,6 +95,16 @@ def test_pictures_and_report_are_written(judged: tuple[dict[str, Any], Path]) ->
         assert picture.size == (6 * 48, 48)
     report = (out / "report.html").read_text()
     assert "000003" in report and "tiny" in report
+
+
+def test_a_folder_of_something_else_is_not_written_into(
+    avatar_file: Path, tiny_capture: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "000003.png").write_text("a holiday")
+    options = EvaluateOptions(avatar_file, tiny_capture, out=tmp_path, device="cpu")
+    with pytest.raises(FolderInUse, match="not empty, and holds no evaluation"):
+        evaluate_run(options)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["a holiday"]
 
 
 def test_truth_is_compared_where_the_capture_has_it(

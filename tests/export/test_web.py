@@ -81,7 +81,7 @@ def test_the_command_writes_a_whole_folder_and_says_what_is_lost(
     assert cli.main([*words, "--light-gain", "1.5", "--lift-shadow", "thumb"]) == 0
     printed = capsys.readouterr()
     assert printed.out.strip() == str(out)
-    assert sorted(os.listdir(out)) == ["index.html", "loss.json"]
+    assert sorted(os.listdir(out)) == [".handavatar", "index.html", "loss.json"]
     assert os.listdir(out.parent) == ["hand"]
     loss = json.loads((out / "loss.json").read_text())
     assert loss["bytes"] == (out / "index.html").stat().st_size < LARGEST
@@ -92,7 +92,30 @@ def test_the_command_writes_a_whole_folder_and_says_what_is_lost(
     assert about["edit"]["light_gain"] == 1.5 and about["edit"]["lifted_bones"] == [13, 14, 15]
     assert about["motion"]["steps"] > 100
     assert cli.main(words) == 2  # It is there already.
+    (out / "notes").write_text("hi")
+    assert cli.main([*words, "--overwrite"]) == 2
+    assert "holds notes, not written by this program" in capsys.readouterr().err
+    assert (out / "notes").read_text() == "hi"
+    (out / "notes").unlink()
+    before = (out / "index.html").stat().st_ino
     assert cli.main([*words, "--overwrite"]) == 0
+    assert sorted(os.listdir(out)) == [".handavatar", "index.html", "loss.json"]
+    assert (out / "index.html").stat().st_ino != before
+    assert os.listdir(out.parent) == ["hand"]
+
+
+@pytest.mark.parametrize("is_unfinished", [False, True])
+def test_a_folder_of_something_else_is_not_replaced(
+    saved: Path, tmp_path: Path, is_unfinished: bool
+) -> None:
+    out = tmp_path / "page"
+    other = tmp_path / "page.unfinished" if is_unfinished else out
+    other.mkdir()
+    (other / "notes").write_text("hi")
+    words = ["export", str(saved), "web", "--out", str(out)]
+    assert cli.main([*words, "--overwrite"]) == 2
+    assert [path.name for path in tmp_path.iterdir()] == [other.name]
+    assert (other / "notes").read_text() == "hi"
 
 
 @pytest.mark.parametrize(

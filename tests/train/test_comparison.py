@@ -70,6 +70,7 @@ def test_the_result_is_json_and_names_what_was_compared(
     assert "minus_pair" not in rows["pair"]
     assert isinstance(value["control_hurts"], bool)
     assert {path.name for path in out.iterdir()} == {
+        ".handavatar",
         "attention.png",
         *(f"{name}-{seed}.safetensors" for name in rows for seed in (0, 1)),
         *(f"{name}-{seed}" for name in rows for seed in (0, 1)),

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from handavatar.avatar import CheckpointError
+from handavatar.jobs.files import MARKER
 from handavatar.train import runs
 from handavatar.train.optimizer_state import (
     optimizer_options,
@@ -98,6 +99,64 @@ def test_a_folder_in_use_is_not_overwritten(tmp_path: Path) -> None:
                 overwrite=overwrite,
             )
     assert (tmp_path / "mine.txt").read_text() == "keep"
+
+
+def test_a_run_is_replaced_only_when_nothing_else_is_lost(tmp_path: Path) -> None:
+    def again(overwrite: bool) -> Run:
+        return create_run(
+            tmp_path / "run",
+            {"steps": 20},
+            seed=2,
+            capture=tmp_path / "capture",
+            capture_sha256="1" * 64,
+            perceptual="x",
+            overwrite=overwrite,
+        )
+
+    run = _new_run(tmp_path / "run")
+    _save(run, 3)
+    with pytest.raises(CheckpointError, match="not empty"):
+        again(overwrite=False)
+    pictures = run.folder / "renders" / "mine" / "rgb.mp4"
+    pictures.parent.mkdir(parents=True)
+    pictures.write_text("film")
+    with pytest.raises(CheckpointError, match=r"holds renders/mine/rgb\.mp4, not written"):
+        again(overwrite=True)
+    assert pictures.read_text() == "film"
+    pictures.unlink()
+    with locked(run), pytest.raises(CheckpointError, match="is writing this run"):
+        again(overwrite=True)
+    _assert_holds(run, 3)
+    (run.folder / MARKER).unlink()  # As older versions left it.
+    assert again(overwrite=True).facts["seed"] == 2
+    assert latest_checkpoint(run) is None and [path.name for path in tmp_path.iterdir()] == ["run"]
+
+
+def test_a_run_json_alone_makes_no_run(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text('{"schema": 1}')
+    with pytest.raises(CheckpointError, match="holds no run of this program's making"):
+        create_run(
+            tmp_path,
+            {},
+            seed=0,
+            capture=tmp_path.parent,
+            capture_sha256="",
+            perceptual="x",
+            overwrite=True,
+        )
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+
+
+@pytest.mark.parametrize("text", ['{"epochs": 3}', '{"avatar_schema": 1}'])
+def test_only_our_own_beginning_is_gone_on_with(tmp_path: Path, text: str) -> None:
+    (tmp_path / "checkpoints").mkdir()
+    (tmp_path / "options.json").write_text(text)
+    if "epochs" in text:
+        with pytest.raises(CheckpointError, match="not empty"):
+            _new_run(tmp_path)
+        assert (tmp_path / "options.json").read_text() == text
+    else:
+        assert _new_run(tmp_path).options == {"steps": 10}
 
 
 def test_no_run_folder_is_a_clear_error(tmp_path: Path) -> None:

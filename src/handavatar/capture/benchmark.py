@@ -15,6 +15,10 @@ from handavatar.capture.checks import CaptureError
 from handavatar.capture.degraded import DegradeOptions, degrade_capture
 from handavatar.capture.pathtracer import LIGHTINGS
 from handavatar.capture.synthetic import SynthOptions, make_capture
+from handavatar.jobs.files import FolderKind, make_folder
+
+BENCHMARK = FolderKind("benchmark")
+"""A folder of captures, each in a folder of its name."""
 
 SUBJECTS: dict[str, tuple[int, float]] = {
     "light": (101, 0.05),
@@ -115,6 +119,8 @@ def make_benchmark(
     Raises:
         CaptureError: for an unknown name, or if Mitsuba is missing.
     """
+    make_folder(folder, BENCHMARK)
+    make_folder(folder / options.size, BENCHMARK)
     folders = []
     for done, name in enumerate(options.names(), start=1):
         target = folder / options.size / name

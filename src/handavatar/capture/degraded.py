@@ -87,6 +87,7 @@ def degrade_capture(folder: Path, options: DegradeOptions, overwrite: bool = Fal
         side=source.side,
         shape_coefficients=source.shape_coefficients,
         overwrite=overwrite,
+        inputs=(source.folder,),
     )
     with writer:
         frames = [source.frame(index) for index in range(len(source.records))]

@@ -45,6 +45,15 @@ from handavatar.capture.checks import (
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.rotations import invert_rigid
 from handavatar.hand.pose import NUM_BONES, HandPose
+from handavatar.jobs.files import (
+    FolderInUse,
+    FolderKind,
+    mark_folder,
+    name_files,
+    refuse_folder_in_use,
+    restore_folder,
+    swap_folder,
+)
 
 SCHEMA = 1
 SPLITS = ("train", "val", "test")
@@ -52,6 +61,28 @@ MAX_FRAMES = 100_000
 COVARIANCES = "covariances.safetensors"
 """File of a capture: tensor ``covariance``, one matrix per frame, in the order of the frames."""
 _MAKE_AGAIN = "make the capture again, or delete this file: poses then count as less sure"
+
+
+def _is_older_capture(folder: Path) -> bool:
+    """Whether a version that left no marker has written the capture; nerfstudio writes no block."""
+    try:
+        block = load_json(folder / "transforms.json").get("handavatar")
+    except CaptureError:
+        return False
+    return isinstance(block, dict) and "schema" in block
+
+
+CAPTURE = FolderKind(
+    "capture",
+    (
+        "transforms.json",
+        *("images/*.png", "masks/*.png", "known/*.png"),
+        *("truth/*.png", "truth/*.json", "truth/*.safetensors"),
+        *("overview.png", "fit.json", "skipped.json", "seen.safetensors", COVARIANCES),
+    ),
+    _is_older_capture,
+)
+"""The folder that :class:`CaptureWriter` makes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -497,6 +528,7 @@ class CaptureWriter:
         side: str = "right",
         shape_coefficients: Float[Tensor, "shapes"] | None = None,
         overwrite: bool = False,
+        inputs: Iterable[Path] = (),
     ) -> None:
         """Refuses a folder that is in use before any work is done.
 
@@ -509,10 +541,12 @@ class CaptureWriter:
             licence: under which terms.
             side: ``left`` if what is written was mirrored.
             shape_coefficients: of the rig, or None if they are not known.
-            overwrite: replace a capture that is already there; never any other folder.
+            overwrite: replace a capture that is already there; never any other folder, nor one
+                that holds files which the program has not written.
+            inputs: files and folders that the capture is made from; ``folder`` may not hold them.
 
         Raises:
-            CaptureError: if ``folder`` is not empty.
+            CaptureError: if ``folder`` holds something that may not be replaced.
         """
         self.folder = Path(folder).absolute()
         self._overwrite = overwrite
@@ -529,19 +563,12 @@ class CaptureWriter:
             self._header["shape_coefficients"] = shape_coefficients.double().tolist()
         self._entries: list[dict[str, Any]] = []
         self._covariances: list[Tensor | None] = []
-        self._refuse_folder_in_use()
-
-    def _refuse_folder_in_use(self) -> None:
-        if not self.folder.exists() or (self.folder.is_dir() and not any(self.folder.iterdir())):
-            return
-        if not self._overwrite:
-            raise CaptureError(
-                f"{self.folder} exists and is not empty", "name another folder, or use --overwrite"
-            )
-        if not (self.folder / "transforms.json").is_file() or self.folder.is_symlink():
-            raise CaptureError(
-                f"{self.folder} is no capture: it will not be overwritten", "name another folder"
-            )
+        self._inputs = tuple(inputs)
+        try:
+            restore_folder(self.folder)
+            refuse_folder_in_use(self.folder, CAPTURE, overwrite, self._inputs)
+        except FolderInUse as error:
+            raise CaptureError(error.found, error.remedy) from error
 
     def __enter__(self) -> "CaptureWriter":
         """Makes the temporary folder."""
@@ -646,19 +673,13 @@ class CaptureWriter:
             stream.flush()
             os.fsync(stream.fileno())
         read_capture(self._aside)
-        self._refuse_folder_in_use()
         self._aside.chmod(0o755)
-        if not self.folder.exists():
-            self._aside.rename(self.folder)
-            return
-        old = Path(tempfile.mkdtemp(prefix=f".{self.folder.name}.", dir=self.folder.parent))
-        self.folder.rename(old)
+        mark_folder(self._aside, CAPTURE)
+        name_files(self._aside)
         try:
-            self._aside.rename(self.folder)
-        except OSError:
-            old.rename(self.folder)
-            raise
-        shutil.rmtree(old)
+            swap_folder(self._aside, self.folder, CAPTURE, self._overwrite, self._inputs)
+        except FolderInUse as error:
+            raise CaptureError(error.found, error.remedy) from error
 
 
 def write_capture(folder: Path, frames: Iterable[Frame], **header: Any) -> Capture:

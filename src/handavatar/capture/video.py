@@ -38,6 +38,7 @@ from handavatar.capture.windows import resampled, window_camera
 from handavatar.geometry.cameras import project
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.files import files_named
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -131,6 +132,7 @@ def capture_video(
         "source": options.file.name,
         "licence": options.licence,
         "overwrite": options.overwrite,
+        "inputs": (options.file, *files_named(options.rig)),
     }
     CaptureWriter(options.out, **header)  # type: ignore[arg-type]  # refuses a folder in use now
     frames = video_frames(options.file, options.fps, options.max_frames)

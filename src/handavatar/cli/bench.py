@@ -77,8 +77,8 @@ _TABLES: dict[str, Callable[[], _Bench]] = {
 def bench(words: list[str]) -> int:
     """Measure a table: ``bench --table ablation|geometry|lift|peers|skin|speed|training``."""
     from handavatar.cli.arguments import JSON, Extra, parse_with, print_json
+    from handavatar.jobs.files import write_atomically
     from handavatar.train.progress import Progress
-    from handavatar.unfinished import write_whole
 
     name = _named_table(words)
     if name not in _TABLES:
@@ -99,7 +99,7 @@ def bench(words: list[str]) -> int:
     with Progress(f"bench {name}", options.total_steps) as progress:
         table = chosen.make(options, progress.update)
     if extras["out"] is not None:
-        write_whole({extras["out"]: table.markdown().encode()})
+        write_atomically({extras["out"]: table.markdown().encode()})
     if extras["json"]:
         print_json(table.record())
     else:

@@ -66,6 +66,8 @@ def explanation(error: BaseException) -> tuple[int, str]:
         return NUMERICAL, text
     if type(error).__name__ == "LicensedRigMissing":
         return LICENSED_FILE_MISSING, text
+    if type(error).__name__ == "FolderInUse":  # An option names a place that cannot be written.
+        return USAGE, text
     # RigError, CaptureError, CheckpointError: the kinds that a user's file can cause.
     if isinstance(error, ValueError) and type(error).__module__.startswith("handavatar."):
         return BAD_DATA, text

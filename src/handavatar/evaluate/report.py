@@ -6,7 +6,6 @@ Knows pictures, numbers and words, nothing of how they were made.
 import base64
 import io
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -19,6 +18,7 @@ from PIL import Image
 from torch import Tensor
 
 from handavatar.geometry.colors import eight_bits
+from handavatar.jobs.files import write_atomically
 
 Metric = float | int | str | bool | None
 """A figure; ``None`` was not measured."""
@@ -94,9 +94,7 @@ def write_report(
         + "\n".join(section for section in sections if section)
         + "\n</main></body></html>\n"
     )
-    unfinished = path.with_name(path.name + ".part")
-    unfinished.write_text(page, encoding="utf-8")
-    os.replace(unfinished, path)
+    write_atomically({path: page.encode()})
 
 
 def picture(

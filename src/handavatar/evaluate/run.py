@@ -27,6 +27,18 @@ from handavatar.evaluate.metrics import (
 from handavatar.evaluate.perceptual import LpipsVgg, perceptual_loss
 from handavatar.evaluate.report import Curve, ReportRow, error_picture, picture, write_report
 from handavatar.hand.pose import HandPose
+from handavatar.jobs.files import FolderKind, claim_folder
+
+
+def _is_older_evaluation(folder: Path) -> bool:
+    """Whether a version that left no marker has judged an avatar there."""
+    return all((folder / name).is_file() for name in ("metrics.json", "report.html"))
+
+
+EVALUATION = FolderKind(
+    "evaluation", ("*.png", "metrics.json", "report.html"), _is_older_evaluation
+)
+"""The folder that :func:`evaluate_run` writes into."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +75,7 @@ def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
     Raises:
         CheckpointError: if the run holds no finished avatar.
         CaptureError: if the capture is damaged or the split is empty.
+        FolderInUse: if ``out`` holds something that is no evaluation.
 
     Source: paper Sec. 4.1 (metrics).
     """
@@ -74,6 +87,7 @@ def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
             f"{capture.folder}: no frame of split {options.split!r}",
             "name another split with --split",
         )
+    claim_folder(out, EVALUATION)
     is_tracked = capture.is_tracked
     frames = [capture.frame(index) for index in indices]
     renderings, judged = [], []
@@ -238,7 +252,6 @@ def _write(
     judged: list[JudgedFrame],
     options: EvaluateOptions,
 ) -> None:
-    out.mkdir(parents=True, exist_ok=True)
     rows = []
     for frame, rendering, pair in zip(frames, renderings, judged, strict=True):
         rendered, truth = pair.on_black()

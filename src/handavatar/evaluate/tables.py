@@ -3,6 +3,10 @@
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 
+from handavatar.jobs.files import FolderKind
+
+TABLES = FolderKind("tables")
+"""A folder in which the figures behind tables are kept."""
 Cell = float | int | str | None
 """``None`` was not measured."""
 

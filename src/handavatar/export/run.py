@@ -22,10 +22,17 @@ from handavatar.export.surface import average_hand, textured_hand
 from handavatar.export.web import web_files
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.hand.pose import HandPose
+from handavatar.jobs.files import (
+    FolderKind,
+    UnfinishedFolder,
+    files_named,
+    refuse_folder_in_use,
+    write_atomically,
+)
 from handavatar.retouch import Look
-from handavatar.unfinished import UnfinishedFolder, is_taken, write_whole
 
 MAX_TEXTURE = 8192
+WEB_PAGE = FolderKind("web page", ("index.html", "loss.json"))
 
 
 @dataclass(frozen=True)
@@ -45,7 +52,7 @@ class ExportOptions(Look):
             turn) that a GLB carries as an animation, and a page plays.
         pose: a gesture (flat, relaxed, fist, point, ...) that PLY and OBJ show.
         unlit: colours with the mean light baked in, and no engine's light on them.
-        overwrite: replace what lies at ``out``.
+        overwrite: replace what lies at ``out``; of folders only a page written by this program.
     """
 
     run: Path
@@ -73,6 +80,7 @@ def export_avatar(options: ExportOptions, tell: Tell = lambda job, step, total: 
         CheckpointError: if the avatar cannot be read.
         CaptureError: if the motion or the paint cannot be read, or there is no such gesture.
         ValueError: for options that contradict each other, or a file that is there already.
+        FolderInUse: if the folder of a page holds something that may not be replaced.
     """
     options.check_look()
     _check(options)
@@ -90,7 +98,7 @@ def export_avatar(options: ExportOptions, tell: Tell = lambda job, step, total: 
         contents = [_ply(avatar, edit, options)]
     else:
         contents = _obj(avatar, edit, options)
-    write_whole(dict(zip(_files(options), contents, strict=True)))
+    write_atomically(dict(zip(_files(options), contents, strict=True)))
     return options.out
 
 
@@ -99,8 +107,7 @@ def _check(options: ExportOptions) -> None:
     if options.format == "web":
         if options.pose != "flat" or options.unlit:
             raise ValueError("--pose, --unlit: a page begins in the capture's pose, and is lit")
-        if is_taken(options.out) and not options.overwrite:
-            raise ValueError(f"--out {options.out}: not empty; name another, or add --overwrite")
+        refuse_folder_in_use(options.out, WEB_PAGE, options.overwrite, _inputs(options))
         return
     if options.out.suffix.lower() != f".{options.format}":
         raise ValueError(f"--out {options.out}: expected a name that ends in .{options.format}")
@@ -115,6 +122,11 @@ def _check(options: ExportOptions) -> None:
     for path in _files(options):
         if path.exists() and not (options.overwrite and path.is_file()):
             raise ValueError(f"--out: {path} exists; name another file, or add --overwrite")
+
+
+def _inputs(options: ExportOptions) -> list[Path]:
+    """What is read: the folder that is written may not hold it."""
+    return [options.run, *files_named(options.motion, options.paint)]
 
 
 def _files(options: ExportOptions) -> list[Path]:
@@ -138,9 +150,9 @@ def _motion(avatar: HandAvatar, options: ExportOptions) -> Motion | None:
 def _write_web(avatar: HandAvatar, edit: Edit, options: ExportOptions, tell: Tell) -> None:
     motion = _motion(avatar, options)
     light = lightweight_hand(avatar, edit, tell)
-    folder = UnfinishedFolder(options.out, {"format": "web"})
-    folder.begin(options.overwrite)
+    folder = UnfinishedFolder(options.out, WEB_PAGE, {"format": "web"}, _inputs(options))
     try:
+        folder.begin(options.overwrite)
         for name, content in web_files(avatar, light, edit, motion).items():
             folder.write(name, content)
         folder.finish()

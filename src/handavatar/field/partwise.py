@@ -22,7 +22,7 @@ from handavatar.field.occupancy import (
     local_points,
     soft_occupancy,
 )
-from handavatar.field.threads import mapped
+from handavatar.jobs.threads import mapped
 from handavatar.field.transformer import TransformerDecoder
 from handavatar.hand.parts import Parts
 from handavatar.hand.rig import PosedHand

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from handavatar.field.threads import mapped
+from handavatar.jobs.threads import mapped
 from handavatar.fit.appearance import SeenColors, SkinColors, see_colors
 from handavatar.fit.energy import (
     EnergyOptions,

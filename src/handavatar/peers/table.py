@@ -14,7 +14,8 @@ from handavatar.avatar import RenderSettings
 from handavatar.capture.checks import load_json
 from handavatar.capture.frames import Frame, read_capture
 from handavatar.evaluate.intervals import mean_interval
-from handavatar.evaluate.tables import Cell, ResultTable, step_counter
+from handavatar.evaluate.tables import TABLES, Cell, ResultTable, step_counter
+from handavatar.jobs.files import make_folder
 from handavatar.peers.inverse_skinning import fit_inverse_skinning
 from handavatar.peers.textured_mesh import RAYS, fit_textured_mesh
 from handavatar.train.ablation import (
@@ -91,7 +92,7 @@ def peers_table(
         else:
             found = about | {"capture": folder.name, "rows": _measured(folder, options, finished)}
             found = json.loads(json.dumps(found))
-            options.kept.mkdir(parents=True, exist_ok=True)
+            make_folder(options.kept, TABLES)
             write_json(path, found)
         measured.append(found)
     return _table(measured, options)

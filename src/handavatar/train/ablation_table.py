@@ -10,7 +10,8 @@ import torch
 
 from handavatar.capture.checks import load_json
 from handavatar.evaluate.intervals import mean_interval
-from handavatar.evaluate.tables import Cell, ResultTable, step_counter
+from handavatar.evaluate.tables import TABLES, Cell, ResultTable, step_counter
+from handavatar.jobs.files import make_folder
 from handavatar.train.ablation import ROWS, ablate
 from handavatar.train.runs import write_json
 
@@ -87,7 +88,7 @@ def ablation_table(
             found["rows"] = {**kept["rows"], **found["rows"]}
             found["seeds"] = list(options.seeds)
             kept = json.loads(json.dumps(found))
-            options.kept.mkdir(parents=True, exist_ok=True)
+            make_folder(options.kept, TABLES)
             write_json(path, kept)
         measured.append(kept)
     return table_of(measured, options)

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from handavatar.evaluate.intervals import mean_interval
-from handavatar.evaluate.tables import Cell, ResultTable
+from handavatar.evaluate.tables import TABLES, Cell, ResultTable
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
 from handavatar.field.occupancy import HandCodes
 from handavatar.field.partwise import PartwiseOccupancy
@@ -29,6 +29,7 @@ from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
+from handavatar.jobs.files import make_folder
 from handavatar.train.attention import attention_figures, attention_picture, read_attention
 from handavatar.train.labelled_poses import LabelledPose
 from handavatar.train.prior import (
@@ -156,7 +157,7 @@ def compare_decoders(
     Source: paper Sec. 4.2, table of geometry.
     """
     _check(options)
-    options.priors.mkdir(parents=True, exist_ok=True)
+    make_folder(options.priors, TABLES)
     rows: dict[str, DecoderScores] = {}
     guides: dict[str, DecoderScores] = {}
     attention: dict[str, Any] = {}

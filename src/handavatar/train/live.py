@@ -31,6 +31,7 @@ from handavatar.train.progress import told_to
 from handavatar.train.runs import Run
 
 Phase = Literal["training", "finished", "stopped"]
+_OWN_FILES = ("progress.json", "avatar.safetensors", "watched")
 _TELL_EVERY = 1.0
 """Seconds between two reports of how far a job is."""
 _SHOW_EVERY = 3.0
@@ -208,7 +209,8 @@ class _Live:
         folder = live_folder(self._run)
         folder.mkdir(exist_ok=True)
         for path in folder.iterdir():
-            path.unlink()
+            if path.name in _OWN_FILES or path.name.startswith(".tmp-"):
+                path.unlink()
 
     def _is_watched(self) -> bool:
         try:

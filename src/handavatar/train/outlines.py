@@ -14,7 +14,7 @@ from handavatar.alignment import aligned_pose
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
 from handavatar.field.shape import personal_hand
-from handavatar.field.threads import mapped
+from handavatar.jobs.threads import mapped
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import unique_edges
 from handavatar.hand.pose import HandPose

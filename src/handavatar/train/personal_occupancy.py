@@ -13,7 +13,7 @@ from torch import Tensor
 
 from handavatar.avatar import HandAvatar
 from handavatar.field.occupancy import HandCodes
-from handavatar.field.threads import mapped
+from handavatar.jobs.threads import mapped
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.pose import HandPose
 from handavatar.train.labelled_poses import training_points

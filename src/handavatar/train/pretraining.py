@@ -20,6 +20,7 @@ from handavatar.field.occupancy import (
 )
 from handavatar.hand.parts import Parts
 from handavatar.hand.rig import PosedHand
+from handavatar.jobs.files import is_empty, make_folder
 from handavatar.train.labelled_poses import LabelledPose
 from handavatar.train.muon import Muon
 from handavatar.train.optimizer_state import (
@@ -29,8 +30,10 @@ from handavatar.train.optimizer_state import (
 )
 from handavatar.train.progress import Progress
 from handavatar.train.runs import (
+    RUN,
     Json,
     Run,
+    is_unfinished_start,
     latest_checkpoint,
     load_checkpoint,
     save_checkpoint,
@@ -226,12 +229,13 @@ def begin_prior_run(folder: Path, options: Json) -> Run:
                 "give the same ones to continue it, or name another folder with --folder"
             )
         return run
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if not is_empty(folder) and not is_unfinished_start(folder):
         raise CheckpointError(
             f"{folder}: holds something that is no pre-training run, expected a new folder\n"
             "name another with --folder"
         )
-    run.checkpoints.mkdir(parents=True)
+    make_folder(folder, RUN)
+    run.checkpoints.mkdir(exist_ok=True)
     write_json(path, options)
     return run
 

@@ -22,10 +22,17 @@ from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
 from handavatar.hand.rigs import load_rig
 from handavatar.hand.surface import extract_hand
+from handavatar.jobs.files import FolderKind, claim_folder
 from handavatar.render.shaded import shaded_mesh
 from handavatar.train.prior import SHIPPED_PRIOR, open_prior
 
 POSES = ("flat", "fist", "pinch", "crossed_fingers")
+PRIOR_PICTURES = FolderKind(
+    "pictures of priors",
+    tuple(f"{pose}.png" for pose in POSES),
+    lambda folder: all((folder / f"{pose}.png").is_file() for pose in POSES),
+)
+"""The folder that :func:`picture_priors` writes into."""
 VIEWS: dict[str, tuple[float, float, float]] = {
     "palm": (0.0, -1.0, 0.0),
     "thumb side": (0.0, 0.0, 1.0),
@@ -73,6 +80,7 @@ def picture_priors(options: PriorPictureOptions) -> list[Path]:
     Raises:
         CheckpointError: if a prior cannot be read.
         RigError: if there is no such rig, or not at this level.
+        FolderInUse: if ``out`` holds something else than such pictures.
     """
     base = load_rig(options.rig, options.level)
     rig, parts = finer_rig(base, options.rounds)
@@ -89,7 +97,7 @@ def picture_priors(options: PriorPictureOptions) -> list[Path]:
         fields[str(path) if path.stem in fields else path.stem] = occupancy_of
     if options.truth:
         fields["guiding mesh"] = lambda hand: Truth(hand, skin).occupancy
-    options.out.mkdir(parents=True, exist_ok=True)
+    claim_folder(options.out, PRIOR_PICTURES)
     written = []
     for pose in POSES:
         hand = rig.shaped().posed(HandPose(gesture_rotations(base, pose), torch.zeros(3)))

@@ -1,7 +1,7 @@
 """The run folder: options, facts, log, checkpoints; survives a kill at any moment.
 
 ```
-run/  options.json  run.json  log.jsonl  avatar.safetensors  .lock
+run/  options.json  run.json  log.jsonl  avatar.safetensors  .lock  .handavatar
       checkpoints/step-000001000/{model,optimizer}.safetensors  state.json  MANIFEST.json
       corrupt/  evaluation/  renders/
 ```
@@ -20,6 +20,7 @@ import re
 import shutil
 import socket
 import sys
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -33,6 +34,16 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from handavatar.avatar import CheckpointError
+from handavatar.jobs.files import (
+    MARKER,
+    FolderInUse,
+    FolderKind,
+    is_empty,
+    mark_folder,
+    read_marker,
+    refuse_folder_in_use,
+    swap_folder,
+)
 from handavatar.train.provenance import package_versions, source_commit
 
 Json = dict[str, Any]
@@ -43,9 +54,32 @@ _MANIFEST = "MANIFEST.json"
 _STATE = "state.json"
 _STEP_FOLDER = re.compile(r"step-(\d{9,})")
 _FILE_NAME = re.compile(r"[a-z][a-z0-9_]*\.(safetensors|json)")
+_ENDINGS = ("safetensors", "json")
 _MAX_MANIFEST_BYTES = 1 << 20
 
 _log = logging.getLogger(__name__)
+
+
+def _is_older_run(folder: Path) -> bool:
+    """Whether a version that left no marker has begun the run."""
+    try:
+        facts = _read_json(folder / "run.json", "")
+    except (CheckpointError, OSError):
+        return False
+    return {"schema", "versions", "seed", "capture", "command"} <= facts.keys()
+
+
+RUN = FolderKind(
+    "run",
+    (
+        *("options.json", "run.json", "log.jsonl", "avatar.safetensors", ".lock"),
+        *(f"{kept}/step-*/*.{end}" for kept in ("checkpoints", "corrupt") for end in _ENDINGS),
+        *(f"live/{name}" for name in ("avatar.safetensors", "progress.json", "watched")),
+        *(f"evaluation/{name}" for name in (MARKER, "*.png", "metrics.json", "report.html")),
+    ),
+    _is_older_run,
+)
+"""The folder that :func:`create_run` makes. What was rendered into it is not listed: it stays."""
 
 
 @dataclass(frozen=True)
@@ -143,22 +177,12 @@ def create_run(
         capture: folder of the capture.
         capture_sha256: fingerprint of the capture's files.
         perceptual: the perceptual loss in use, ``lpips-vgg`` or the substitute's name.
-        overwrite: replace the run that lies there; a folder that is no run is never touched.
+        overwrite: replace the run that lies there, unless it is being trained or holds files that
+            no training writes; a folder that is no run is never touched.
 
     Raises:
         CheckpointError: if the folder holds something already.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        is_replaced = overwrite and (folder / "run.json").is_file()
-        if not (is_replaced or _is_unfinished_start(folder)):
-            raise CheckpointError(
-                f"{folder}: not empty, expected a new folder\n"
-                "name another with --out, or continue this run with --resume auto"
-            )
-        shutil.rmtree(folder)
-    run = Run(folder)
-    run.checkpoints.mkdir(parents=True)
-    write_json(folder / "options.json", options)
     facts = {
         "schema": _SCHEMA,
         "versions": package_versions(),
@@ -169,18 +193,55 @@ def create_run(
         "perceptual": perceptual,
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
     }
+    try:
+        if is_empty(folder) or is_unfinished_start(folder):
+            _write_start(folder, options, facts)
+        elif overwrite and (folder / "run.json").is_file():
+            _replace_run(folder, options, facts, capture)
+        else:
+            raise FolderInUse(f"{folder}: not empty", "")
+    except FolderInUse as error:
+        raise CheckpointError(
+            f"{error.found}, expected a new folder\n"
+            "name another with --out, or continue the run that is there with --resume auto"
+        ) from error
+    return Run(folder)
+
+
+def _write_start(folder: Path, options: Json, facts: Json) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    mark_folder(folder, RUN)
+    Run(folder).checkpoints.mkdir(exist_ok=True)
+    write_json(folder / "options.json", options)
     write_json(folder / "run.json", facts)
-    return run
 
 
-def _is_unfinished_start(folder: Path) -> bool:
+def _replace_run(folder: Path, options: Json, facts: Json, capture: Path) -> None:
+    """Puts the start of a run in the place of another one, which nobody may be training."""
+    refuse_folder_in_use(folder, RUN, True, (capture,))
+    with tempfile.TemporaryDirectory(
+        prefix=f".{folder.name}.", suffix=".part", dir=folder.absolute().parent
+    ) as beside:
+        whole = Path(beside) / folder.name
+        _write_start(whole, options, facts)
+        with locked(Run(folder)):
+            swap_folder(whole, folder, RUN, True, (capture,))
+
+
+def is_unfinished_start(folder: Path) -> bool:
     """Whether a folder is what :func:`create_run` leaves if it is killed between its files."""
-    if not (folder / "checkpoints").is_dir() or any((folder / "checkpoints").iterdir()):
+    if not folder.is_dir():
         return False
-    return all(
-        path.name in ("checkpoints", "options.json") or path.name.startswith(".tmp-")
-        for path in folder.iterdir()
-    )
+    if (folder / "checkpoints").is_dir() and any((folder / "checkpoints").iterdir()):
+        return False
+    names = {path.name for path in folder.iterdir() if not path.name.startswith(".tmp-")}
+    if not names or not names <= {MARKER, "checkpoints", "options.json"}:
+        return False
+    if MARKER in names:
+        return (read_marker(folder) or {}).get("kind") == RUN.name
+    # Before there were markers. Nothing is lost with what is not somebody else's.
+    options = _read_json(folder / "options.json", "") if "options.json" in names else {}
+    return "checkpoints" in names and (not options or "avatar_schema" in options)
 
 
 def open_run(folder: Path) -> Run:

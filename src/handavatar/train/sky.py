@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
 from handavatar.field.anchors import Neighbours
-from handavatar.field.threads import mapped
+from handavatar.jobs.threads import mapped
 from handavatar.render.skylight import even_directions
 from handavatar.render.volume import composite_sparse
 from handavatar.train.appearance import SeenSamples, chosen_samples

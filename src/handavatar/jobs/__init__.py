@@ -1,0 +1,1 @@
+"""What a long command needs and no hand knows."""

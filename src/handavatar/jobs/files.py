@@ -1,0 +1,505 @@
+"""Files and folders that are written aside, and put in place when they are whole.
+
+Every folder that the program makes carries a marker, ``.handavatar``: what it is, the version that
+made it, when, and, where a folder is put in place at once, the names of its files. Only what
+carries the marker is ever removed or replaced, and only while it holds nothing of somebody else's.
+
+A folder of frames is filled under the name ``NAME.unfinished``: what a killed process has finished
+stays, and the same command given again does only the rest.
+"""
+
+import contextlib
+import fnmatch
+import json
+import logging
+import os
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from handavatar import __version__
+
+MARKER = ".handavatar"
+"""Name of the file that says that, and how, the program made a folder."""
+_MAX_MARKER_BYTES = 64 * 2**20
+_OF_THE_SYSTEM = {".DS_Store", "Thumbs.db", "desktop.ini"}
+_NAMED_STRANGERS = 3
+
+_log = logging.getLogger(__name__)
+
+
+class FolderInUse(ValueError):
+    """A place where a folder cannot be written.
+
+    Attributes:
+        found: what lies there.
+        remedy: what to do about it.
+    """
+
+    def __init__(self, found: str, remedy: str) -> None:
+        """Keeps the two halves apart, for those who have an error of their own."""
+        super().__init__(f"{found}\n{remedy}")
+        self.found = found
+        self.remedy = remedy
+
+
+def _never(folder: Path) -> bool:
+    return False
+
+
+@dataclass(frozen=True)
+class FolderKind:
+    """One kind of folders that the program makes.
+
+    Attributes:
+        name: in the marker and in messages, such as ``capture``.
+        files: patterns of the files that the program writes there, relative to the folder; a
+            ``*`` stands for folders as well.
+        is_older: whether a folder without a marker was made by a version that wrote none.
+    """
+
+    name: str
+    files: tuple[str, ...] = ()
+    is_older: Callable[[Path], bool] = _never
+
+
+def write_atomically(files: Mapping[Path, bytes]) -> None:
+    """Writes all files aside and then renames them: nothing half written is ever at its place."""
+    pending: dict[Path, Path] = {}
+    try:
+        for path, content in files.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            pending[path] = path.with_name(f".tmp-{os.getpid()}-{path.name}")
+            pending[path].write_bytes(content)
+        for path, aside in pending.items():
+            os.replace(aside, path)
+    finally:
+        for aside in pending.values():
+            aside.unlink(missing_ok=True)
+
+
+# --- the marker -----------------------------------------------------------------------------------
+
+
+def mark_folder(folder: Path, kind: FolderKind, facts: Mapping[str, Any] | None = None) -> None:
+    """Writes the marker of a folder that is there.
+
+    Args:
+        folder: that the program has made.
+        kind: what it is.
+        facts: what else the marker says, as JSON.
+    """
+    marker = {
+        "program": "handavatar",
+        "version": __version__,
+        "kind": kind.name,
+        "time": datetime.now().astimezone().isoformat(timespec="seconds"),
+    }
+    text = json.dumps(marker | dict(facts or {}), allow_nan=False) + "\n"
+    write_atomically({folder / MARKER: text.encode()})
+
+
+def read_marker(folder: Path) -> dict[str, Any] | None:
+    """What the marker of a folder says; None if it has none, or one that is not ours."""
+    path = folder / MARKER
+    try:
+        if path.is_symlink() or path.stat().st_size > _MAX_MARKER_BYTES:
+            return None
+        marker = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return None
+    if not isinstance(marker, dict) or marker.get("program") != "handavatar":
+        return None
+    return marker if isinstance(marker.get("kind"), str) else None
+
+
+def make_folder(folder: Path, kind: FolderKind) -> None:
+    """Makes a folder, with those above it, and marks it; one that holds something stays as it is.
+
+    Raises:
+        OSError: if it cannot be made.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    if not any(folder.iterdir()):
+        mark_folder(folder, kind)
+
+
+def claim_folder(folder: Path, kind: FolderKind) -> None:
+    """Makes a folder in which files are written one by one, or goes on in one of the same kind.
+
+    Nothing is removed.
+
+    Raises:
+        FolderInUse: if it holds something else, whose files might be written over.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise FolderInUse(f"{folder} is a file, expected a folder", "name a folder")
+    if is_empty(folder):
+        make_folder(folder, kind)
+        return
+    marker = read_marker(folder)
+    if marker is None and kind.is_older(folder):
+        mark_folder(folder, kind)
+    elif marker is None or marker["kind"] != kind.name:
+        raise FolderInUse(
+            f"{folder}: not empty, and {_refused(marker, kind)}",
+            "name a folder that is new or empty",
+        )
+
+
+def name_files(folder: Path, patterns: Iterable[str] = ("*",)) -> None:
+    """Adds to a folder's marker which files are the program's: from now on all others are not.
+
+    Args:
+        folder: that carries the marker.
+        patterns: as of :class:`FolderKind`; all the files that are there by default.
+
+    Raises:
+        FolderInUse: if it carries none.
+    """
+    marker = read_marker(folder)
+    if marker is None:
+        raise FolderInUse(f"{folder} carries no {MARKER}", "mark it first")
+    names = sorted(path.relative_to(folder).as_posix() for path in _files_in(folder))
+    marker["files"] = [name for name in names if name != MARKER and _fits(name, patterns)]
+    write_atomically({folder / MARKER: (json.dumps(marker) + "\n").encode()})
+
+
+def strangers_in(folder: Path, kind: FolderKind) -> list[str]:
+    """Files in a folder that the program has not written, relative to it.
+
+    Args:
+        folder: of this kind. If its marker lists files, these are the program's, else those that
+            the kind's patterns fit.
+        kind: what the program writes there.
+    """
+    listed = (read_marker(folder) or {}).get("files")
+    own = set(listed) if isinstance(listed, list) else None
+    strangers = []
+    for path in _files_in(folder):
+        relative = path.relative_to(folder).as_posix()
+        if relative == MARKER or path.name in _OF_THE_SYSTEM or _is_leftover(path):
+            continue
+        is_own = relative in own if own is not None else _fits(relative, kind.files)
+        if path.is_symlink() or not is_own:
+            strangers.append(relative)
+    return sorted(strangers)
+
+
+def _files_in(folder: Path) -> list[Path]:
+    """All files and links below a folder; links are not followed."""
+    found = []
+    for top, folders, names in os.walk(folder):
+        links = [name for name in folders if (Path(top) / name).is_symlink()]
+        found += [Path(top) / name for name in (*links, *names)]
+    return found
+
+
+def _fits(name: str, patterns: Iterable[str]) -> bool:
+    return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def _is_leftover(path: Path) -> bool:
+    """Whether a killed process has left a file half written."""
+    return fnmatch.fnmatchcase(path.name, ".tmp-[0-9]*-*")
+
+
+def _refused(marker: Mapping[str, Any] | None, kind: FolderKind) -> str:
+    """Why a folder is not of this kind."""
+    if marker is None:
+        return f"holds no {kind.name} of this program's making"
+    return f"is marked as {_printable(marker['kind'])}, not as {kind.name}"
+
+
+def _printable(name: str) -> str:
+    """A name from outside without what a terminal would obey."""
+    return name[:200] if name.isprintable() else ascii(name[:200])
+
+
+def is_empty(folder: Path) -> bool:
+    """Whether nothing lies where a folder is to be written, or an empty folder."""
+    return not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+
+
+def files_named(*names: str | Path | None) -> list[Path]:
+    """Those of the names that are files: a word of an option can mean one, or something else."""
+    return [Path(name) for name in names if name is not None and Path(name).is_file()]
+
+
+# --- replacing a folder ---------------------------------------------------------------------------
+
+
+def refuse_folder_in_use(
+    target: Path, kind: FolderKind, overwrite: bool = False, inputs: Iterable[Path] = ()
+) -> None:
+    """Refuses a place for a new folder, unless nothing of anybody's is lost there.
+
+    Args:
+        target: where a whole folder is to be put.
+        kind: what it will be.
+        overwrite: whether a folder of the same kind, and nothing else, may be replaced.
+        inputs: files and folders that are read; the target may not hold them.
+
+    Raises:
+        FolderInUse: if something else lies there: a file, a link, a folder that the program has
+            not made, one of another kind, one with a stranger's file in it, a home directory, the
+            folder the command was started in or one above it or above an input.
+    """
+    target = _absolute(target)
+    if target.is_symlink():
+        raise FolderInUse(
+            f"{target} is a link, expected a folder", "give what it leads to, or another name"
+        )
+    if not target.exists():
+        return
+    if not target.is_dir():
+        raise FolderInUse(f"{target} is a file, expected a folder", "name another folder")
+    for path, what in _irreplaceable(inputs):
+        if _is_within(path, target):
+            holds = "is" if _is_same(path, target) else "holds"
+            raise FolderInUse(f"{target} {holds} {what}", "name another folder")
+    if os.path.ismount(target):
+        raise FolderInUse(f"{target} is where a disk is mounted", "name a folder in it")
+    if is_empty(target):
+        return
+    if not overwrite:
+        raise FolderInUse(f"{target}: not empty", "name another folder, or use --overwrite")
+    marker = read_marker(target)
+    if not kind.is_older(target) if marker is None else marker["kind"] != kind.name:
+        raise FolderInUse(
+            f"{target} {_refused(marker, kind)}: it will not be overwritten",
+            "name another folder, or move away what lies there",
+        )
+    strangers = strangers_in(target, kind)
+    if strangers:
+        raise FolderInUse(
+            f"{target} holds {_listed(strangers)}, not written by this program: it will not be "
+            "overwritten",
+            "move that away, or name another folder",
+        )
+
+
+def swap_folder(
+    whole: Path,
+    target: Path,
+    kind: FolderKind,
+    overwrite: bool = False,
+    inputs: Iterable[Path] = (),
+) -> None:
+    """Puts a whole folder where it belongs; what it replaces is removed when it is in place.
+
+    Two renames: the old folder takes a hidden name beside, the new one its place. If that fails
+    the old one is put back. A process killed between the two leaves both, whole.
+
+    Args:
+        whole: folder on the same disk as ``target``, with its marker.
+        target: as in :func:`refuse_folder_in_use`, and so are the others.
+        kind: what it is.
+        overwrite: whether a folder of the same kind may be replaced.
+        inputs: what the target may not hold.
+
+    Raises:
+        FolderInUse: as :func:`refuse_folder_in_use`; nothing has changed then.
+    """
+    target = _absolute(target)
+    refuse_folder_in_use(target, kind, overwrite, inputs)
+    if is_empty(target):
+        os.rename(whole, target)
+        return
+    if read_marker(target) is None:
+        mark_folder(target, kind)
+    old = _hidden_name(target)
+    os.rename(target, old)
+    try:
+        os.rename(whole, target)
+    except BaseException:
+        os.rename(old, target)
+        raise
+    for left in _hidden_folders(target):
+        try:
+            if any(left.iterdir()):
+                remove_folder(left)
+            else:
+                left.rmdir()
+        except OSError as error:
+            _log.warning("%s: replaced, but cannot be removed (%s)", left, error)
+
+
+def restore_folder(target: Path) -> None:
+    """Puts a folder back that a process, killed while it replaced it, left under a hidden name."""
+    target = _absolute(target)
+    if target.exists() or target.is_symlink():
+        return
+    for old in _hidden_folders(target):
+        if any(old.iterdir()):
+            os.rename(old, target)
+            return
+
+
+def remove_folder(folder: Path) -> None:
+    """Removes a folder that carries the marker, the marker last.
+
+    Raises:
+        FolderInUse: if it carries none.
+        OSError: if it cannot be removed; what is left carries the marker still.
+    """
+    if folder.is_symlink() or read_marker(folder) is None:
+        raise FolderInUse(f"{folder} is nothing that this program made", "remove it yourself")
+    for path in folder.iterdir():
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif path.name != MARKER:
+            path.unlink()
+    (folder / MARKER).unlink()
+    folder.rmdir()
+
+
+def _hidden_name(target: Path) -> Path:
+    for number in count():
+        old = target.with_name(f".{target.name}.replaced-{os.getpid()}-{number}")
+        if not os.path.lexists(old):
+            return old
+    raise AssertionError("there is always a number that is free")
+
+
+def _hidden_folders(target: Path) -> list[Path]:
+    """Replaced folders of this name that a process, ended before its time, left; or their last."""
+    if not target.parent.is_dir():
+        return []
+    begin = f".{target.name}.replaced-"
+    found = (path for path in target.parent.iterdir() if path.name.startswith(begin))
+    folders = [path for path in found if path.is_dir() and not path.is_symlink()]
+    return sorted(p for p in folders if read_marker(p) is not None or not any(p.iterdir()))
+
+
+def _absolute(path: Path) -> Path:
+    return Path(os.path.abspath(path))
+
+
+def _irreplaceable(inputs: Iterable[Path]) -> list[tuple[Path, str]]:
+    """What nobody wants to lose, and what to call it."""
+    home = os.path.expanduser("~")
+    places = [(Path(home), "a home directory")] if os.path.isabs(home) else []
+    with contextlib.suppress(FileNotFoundError):  # It was removed meanwhile.
+        places.append((Path.cwd(), "the folder that the command was started in"))
+    return [*places, *((Path(path), f"what is read: {path}") for path in inputs)]
+
+
+def _is_within(path: Path, folder: Path) -> bool:
+    path = Path(os.path.realpath(path))
+    return any(_is_same(place, folder) for place in (path, *path.parents))
+
+
+def _is_same(path: Path, other: Path) -> bool:
+    try:
+        return os.path.samefile(path, other)
+    except OSError:
+        return False
+
+
+def _listed(names: list[str]) -> str:
+    shown = ", ".join(_printable(name) for name in names[:_NAMED_STRANGERS])
+    more = len(names) - _NAMED_STRANGERS
+    return f"{shown} and {more} more" if more > 0 else shown
+
+
+# --- folders that fill slowly ---------------------------------------------------------------------
+
+
+class UnfinishedFolder:
+    """``NAME.unfinished`` beside the folder that it will become.
+
+    A frame is finished when all its files are there: each is written aside and renamed.
+    """
+
+    def __init__(
+        self,
+        target: Path,
+        kind: FolderKind,
+        record: dict[str, Any],
+        inputs: Iterable[Path] = (),
+    ) -> None:
+        """Names the folder; nothing is written yet.
+
+        Args:
+            target: what it becomes.
+            kind: what that will be.
+            record: all that the frames depend on, as JSON; frames of another record are worthless.
+            inputs: files and folders that are read; the target may not hold them.
+        """
+        self.target = _absolute(target)
+        self.path = self.target.with_name(self.target.name + ".unfinished")
+        self._kind = kind
+        self._inputs = tuple(inputs)
+        # As JSON gives them back: tuples are lists there.
+        self._facts = json.loads(json.dumps({"becomes": self.target.name, "record": record}))
+        self._overwrite = False
+        self._is_begun = False
+
+    def begin(self, overwrite: bool) -> None:
+        """Makes the folder, or keeps what the same work has left there; one process alone.
+
+        Raises:
+            FolderInUse: if the target holds something that may not be replaced, or if what has
+                the name of the unfinished folder was not left there by this program.
+        """
+        restore_folder(self.target)
+        refuse_folder_in_use(self.target, self._kind, overwrite, self._inputs)
+        self._overwrite = overwrite
+        if os.path.lexists(self.path) and not self._keeps_what_is_there():
+            remove_folder(self.path)
+        if not self.path.exists():
+            self.path.mkdir(parents=True)
+            mark_folder(self.path, self._kind, self._facts)
+        self._is_begun = True
+
+    def _keeps_what_is_there(self) -> bool:
+        """Whether frames of the same work lie there; False if they are of other work of ours."""
+        is_folder = self.path.is_dir() and not self.path.is_symlink()
+        if is_folder and all(_is_leftover(path) for path in self.path.iterdir()):
+            # Of a process that was killed before it could mark it.
+            mark_folder(self.path, self._kind, self._facts)
+        marker = (read_marker(self.path) if is_folder else None) or {}
+        is_ours = (marker.get("kind"), marker.get("becomes")) == (
+            self._kind.name,
+            self.target.name,
+        )
+        if is_ours and marker.get("record") == self._facts["record"]:
+            return True
+        strangers = strangers_in(self.path, self._kind) if is_ours else []
+        if not is_ours or strangers:
+            what = f"holds {_listed(strangers)}, which" if strangers else "is in the way, and"
+            raise FolderInUse(
+                f"{self.path} {what} this program did not leave there: it stays",
+                "move it away, or name another folder",
+            )
+        return False
+
+    def has(self, names: Iterable[str]) -> bool:
+        """Whether all these files are there, whole."""
+        return all((self.path / name).is_file() for name in names)
+
+    def write(self, name: str, content: bytes) -> None:
+        """Writes one file aside and renames it into place."""
+        write_atomically({self.path / name: content})
+
+    def finish(self) -> None:
+        """Takes the target's place; one process alone, when all is there.
+
+        Raises:
+            FolderInUse: if something lies there by now that may not be replaced.
+        """
+        for left in self.path.rglob(".tmp-*"):
+            if _is_leftover(left):  # Of killed processes.
+                left.unlink()
+        name_files(self.path, self._kind.files)
+        swap_folder(self.path, self.target, self._kind, self._overwrite, self._inputs)
+
+    def abandon(self) -> None:
+        """Removes the folder unless a frame is finished: then a rerun goes on from it."""
+        if self._is_begun and not any(path.is_dir() for path in self.path.glob("*")):
+            shutil.rmtree(self.path, ignore_errors=True)
