@@ -14,6 +14,7 @@ from torch import Tensor
 
 from handavatar.fit.appearance import SkinColors, fit_colors
 from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
+from handavatar.fit.landmarks import landmark_rest, offset_tolerances
 from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, moved_pose, pose_difference
 from handavatar.fit.pictures import FramePicture
 from handavatar.fit.shape import ShapeSpace, fixed_shape
@@ -71,7 +72,6 @@ class Registered:
             then translation (metres).
         hand: rest hand with its shape as found.
         energies: how badly each frame is explained; a good one has about as many as the best.
-        is_kept: frames that kept a pose found, and not the tracked one.
         pose_error: degrees by which the tracked poses were off, as learned.
         colors: of the surface's points, if they were looked at.
     """
@@ -114,6 +114,7 @@ def register(
     options: RegisterOptions,
     is_sequence: bool = False,
     learns_shape: bool = True,
+    start: Float[Tensor, "63"] | None = None,
     progress: Progress | None = None,
 ) -> Registered:
     """Lays one hand onto all frames.
@@ -127,6 +128,7 @@ def register(
         options: expected errors, rounds.
         is_sequence: whether the frames are neighbours in time.
         learns_shape: whether the hand's shape moves.
+        start: offsets of the landmarks to begin with, where there are landmarks; zeros if None.
         progress: told how far it is.
     """
     report = progress or (lambda share: None)
@@ -137,9 +139,18 @@ def register(
     generator = torch.Generator().manual_seed(options.seed)
     surface = sample_surface_evenly(rig.template_vertices, rig.faces, _NUM_POINTS, generator)
     none = RestPoints(torch.zeros(0, 3), torch.zeros(0, 16), torch.zeros(0, 3, 0))
+    has_landmarks = any(seen.landmarks is not None for seen in observations)
+    num_shapes = len(space.sigmas)
 
     def points_of(shared: Float[Tensor, "shared"], frame: int) -> HandPoints:
-        return HandPoints(space.shaped(hand, shared), space, surface, none)
+        shaped = space.shaped(hand, shared[:num_shapes])
+        landmarks = landmark_rest(shaped, space, shared[num_shapes:]) if has_landmarks else none
+        return HandPoints(shaped, space, surface, landmarks)
+
+    sigmas = torch.cat([space.sigmas, offset_tolerances()]) if has_landmarks else space.sigmas
+    shared = torch.zeros(len(sigmas))
+    if start is not None:
+        shared[num_shapes:] = start
 
     error = options.pose_error
     is_learned = information is None and options.learns_pose_error
@@ -151,11 +162,11 @@ def register(
         tracked=tracked,
         information=information,
         points_of=points_of,
-        shared_sigmas=space.sigmas,
+        shared_sigmas=sigmas,
         options=options.energy,
         is_sequence=is_sequence,
         poses=tracked,
-        shared=torch.zeros(len(space.sigmas)),
+        shared=shared,
     )
     for outlier in (_WIDE, _MIDDLE):
         descent.step_poses(Look(_FINE, outlier), 4)
