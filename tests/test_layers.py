@@ -26,7 +26,8 @@ MAY_IMPORT = {
         "alignment": "geometry hand render",
         # The slow renderer that the fast one is measured against.
         "plain": "geometry field render avatar",
-        "evaluate": "geometry hand capture edit avatar alignment plain",
+        # Registers poses, fits the textured mesh that it compares with, and films what it judged.
+        "evaluate": "geometry hand capture field render edit avatar alignment plain animate",
         "train": "geometry hand capture field render avatar plain alignment evaluate processes",
         # Prior art, for a table alone.
         "peers": "geometry hand capture field render avatar evaluate train",
