@@ -14,8 +14,7 @@ from handavatar.evaluate.textured_mesh import fit_textured_mesh
 from handavatar.hand.pose import HandPose
 
 MESH_FRAMES, MESH_STEPS = 30, 300
-"""The textured mesh sees at most so many training frames, evenly spread, and takes so many steps:
-half a minute to a minute of one core."""
+"""The textured mesh sees at most so many training frames, evenly spread; so many steps."""
 
 
 def training_color(capture: Capture) -> Float[Tensor, "3"] | None:
@@ -56,7 +55,7 @@ def textured_mesh_psnr(
     places = torch.linspace(0, len(indices) - 1, count).round().long().tolist()
     training = [capture.frame(indices[place]) for place in places]
     training = [replace(frame, pose=pose_of(frame)) for frame in training]
-    picture_of = fit_textured_mesh(avatar, training, color, MESH_STEPS, seed=0)
+    picture_of = fit_textured_mesh(avatar, training, color, MESH_STEPS, seed=0, rays=1)
     ratios = []
     for frame, pose in zip(frames, poses, strict=True):
         values = picture_of(replace(frame, pose=pose))

@@ -73,25 +73,32 @@ class MeshPoints:
 
 
 @torch.no_grad()
-def mesh_points(avatar: HandAvatar, texels: SurfacePoints, frame: Frame) -> MeshPoints:
-    """Rasterises the personal mesh in the frame's pose."""
+def mesh_points(
+    avatar: HandAvatar, texels: SurfacePoints, frame: Frame, rays: int = RAYS
+) -> MeshPoints:
+    """Rasterises the personal mesh in the frame's pose, ``rays`` a pixel in each direction."""
     pose, camera = frame.pose.to(avatar.device), frame.camera.to(avatar.device)
     posed = avatar.personal(pose).posed(pose)
-    fine = camera.resized(RAYS * camera.width, RAYS * camera.height)
+    fine = camera.resized(rays * camera.width, rays * camera.height)
     fragments = rasterize(posed.vertices, avatar.rig.faces, fine)
     y, x = fragments.mask.nonzero().unbind(-1)
     normals = vertex_normals(posed.vertices, avatar.rig.faces)
     values = torch.cat([posed.vertices, normals], dim=-1)
     found = interpolate(fragments, avatar.rig.faces, values)[y, x]
     neighbours = nearest_anchors(texels.positions(posed.vertices), found[:, :3])
-    pixels = (y // RAYS) * camera.width + x // RAYS
+    pixels = (y // rays) * camera.width + x // rays
     normals = nn.functional.normalize(found[:, 3:], dim=-1).cpu()
     neighbours = Neighbours(neighbours.indices.cpu(), neighbours.weights.cpu())
     return MeshPoints(pixels.cpu(), neighbours, normals)
 
 
 def fit_textured_mesh(
-    avatar: HandAvatar, frames: list[Frame], color: Float[Tensor, "3"], steps: int, seed: int
+    avatar: HandAvatar,
+    frames: list[Frame],
+    color: Float[Tensor, "3"],
+    steps: int,
+    seed: int,
+    rays: int = RAYS,
 ) -> Callable[[Frame], Float[Tensor, "height width 4"]]:
     """Fits texture and light to the known pixels of the frames, without their gain.
 
@@ -101,6 +108,7 @@ def fit_textured_mesh(
         color: mean of their hand pixels.
         steps: of Adam.
         seed: of texels and pixels.
+        rays: of a pixel in each direction, in the frames that it learns from.
 
     Returns:
         Colour on black and coverage of another frame's pose and camera, as the capture's average
@@ -115,7 +123,7 @@ def fit_textured_mesh(
     mesh = TexturedMesh(NUM_TEXELS, color)
     indices, weights, normals, truth = [], [], [], []
     for frame in frames:
-        points = mesh_points(avatar, texels, frame)
+        points = mesh_points(avatar, texels, frame, rays)
         image = frame.image.flatten(0, 1)[points.pixels].float() / 255 / frame.gain
         # Pixels that the hand covers in part show background as well.
         kept = ((frame.alpha > 0.99) & frame.known).flatten()[points.pixels]
