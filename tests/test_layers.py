@@ -30,7 +30,10 @@ MAY_IMPORT = {
         "alignment": "geometry hand render",
         # The slow renderer that the fast one is measured against.
         "plain": "geometry field render avatar",
-        "evaluate": "geometry jobs hand fit capture edit avatar alignment plain",
+        # Registers poses, fits the textured mesh that it compares with, and films what it judged.
+        "evaluate": (
+            "geometry jobs hand fit capture field render edit avatar alignment plain animate"
+        ),
         "train": (
             "geometry jobs hand fit capture field render avatar plain alignment evaluate processes"
         ),

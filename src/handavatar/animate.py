@@ -334,25 +334,26 @@ def pass_pictures(rendering: Rendering, side: str = "right") -> dict[str, np.nda
 class VideoWriter:
     """Writes RGB pictures into an H.264 video that every player opens."""
 
-    def __init__(self, path: Path, fps: float, size: int) -> None:
-        """Opens the file; pictures of odd size lose their last row and column.
+    def __init__(self, path: Path, fps: float, size: int, width: int | None = None) -> None:
+        """Opens the file; pictures of odd size lose their last row or column.
 
         Args:
             path: ends in ``.mp4``.
             fps: pictures per second.
             size: pixels along a side.
+            width: of a picture that is no square, which then is ``size`` high.
         """
-        self._even = size // 2 * 2
+        self._height, self._width = size // 2 * 2, (width or size) // 2 * 2
         self._container = av.open(str(path), "w")
         rate = Fraction(fps).limit_denominator(1000)
         self._stream: Any = self._container.add_stream("libx264", rate=rate)
-        self._stream.width = self._stream.height = self._even
+        self._stream.width, self._stream.height = self._width, self._height
         self._stream.pix_fmt = "yuv420p"
         self._stream.options = {"crf": "18"}
 
     def add(self, pixels: np.ndarray) -> None:
-        """Adds one picture, (size, size, 3), 8 bit."""
-        cut = np.ascontiguousarray(pixels[: self._even, : self._even])
+        """Adds one picture, (size, width, 3), 8 bit."""
+        cut = np.ascontiguousarray(pixels[: self._height, : self._width])
         frame = av.VideoFrame.from_ndarray(cut, format="rgb24")
         self._container.mux(self._stream.encode(frame))
 

@@ -33,13 +33,13 @@ from handavatar.field.shading import (
     directed_occupancy,
 )
 from handavatar.field.shape import ShapeOffsets, personal_hand
-from handavatar.jobs.threads import mapped
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
 from handavatar.hand.parts import finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import RIG_ARRAYS, PosedHand, Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
+from handavatar.jobs.threads import mapped
 from handavatar.render.rasterize import covered_pixels
 from handavatar.render.sampling import depths_along, intervals_through_boxes
 from handavatar.render.skylight import even_directions, sky_light

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from handavatar.evaluate.metrics import (
     JudgedFrame,
     albedo_psnr,
     dilated,
+    exposed,
     mask_iou,
     masked_psnr,
     masked_scores,
@@ -29,6 +31,7 @@ from handavatar.evaluate.metrics import (
     ssim,
     ssim_map,
     worst_mean,
+    zone_scores,
 )
 
 
@@ -180,6 +183,65 @@ def test_masked_ssim_is_the_mean_of_the_map_over_the_region() -> None:
     assert masked_ssim(judged) == pytest.approx(np.mean(chosen), abs=1e-5)
 
 
+def test_unknown_pixels_count_in_no_figure() -> None:
+    judged, known = frame(6), torch.ones(48, 40, dtype=torch.bool)
+    known[:, 24:] = False
+    generator = torch.Generator().manual_seed(0)
+    scribble = torch.where(known[..., None], judged.truth, torch.rand(48, 40, 3))
+    covered = torch.where(known, judged.truth_coverage, torch.rand(48, 40, generator=generator))
+    scribble[0, 30] = math.nan
+    clean = replace(judged, known=known)
+    spoilt = replace(clean, truth=scribble, truth_coverage=covered)
+    assert paper_scores([clean]) == paper_scores([spoilt])
+    assert masked_scores([clean]) == masked_scores([spoilt])
+    assert zone_scores([clean]) == zone_scores([spoilt])
+    assert mean_mask_iou([clean]) == mean_mask_iou([spoilt])
+    # Nor does it matter what the avatar does there.
+    elsewhere = replace(clean, rendered=torch.where(known[..., None], clean.rendered, 1.0))
+    assert masked_scores([elsewhere]) == masked_scores([clean])
+    assert paper_scores([elsewhere]) == paper_scores([clean])
+    # But what is known counts.
+    assert masked_psnr(clean) != masked_psnr(judged)
+    assert paper_scores([clean]).hand_share == pytest.approx(
+        float(judged.truth_mask[:, :24].float().mean())
+    )
+
+
+def test_the_core_is_deep_inside_both_masks_and_the_border_the_rest_of_the_region() -> None:
+    mask = disc(60, 256, 256)
+    truth = torch.full((256, 256, 3), 0.5)
+    shifted = mask.roll(10, 1)
+    judged = JudgedFrame(truth * shifted[..., None], shifted, truth, mask.float())
+    core = judged.core()
+    brute = ~dilated(~(mask & shifted), 6.0)
+    assert torch.equal(core, brute) and bool(core.any())
+    scores = zone_scores([judged])
+    assert scores.core_psnr == PSNR_CEILING
+    assert scores.border_error_share == 1
+    assert scores.core_share == pytest.approx(int(core.sum()) / int(judged.region().sum()))
+    # An error of the core alone.
+    darker = judged.rendered - 0.1 * core[..., None]
+    scores = zone_scores([replace(judged, rendered=darker, rendered_mask=shifted)])
+    assert scores.core_psnr is not None and scores.core_psnr == pytest.approx(20, abs=0.2)
+    both = zone_scores([judged, replace(judged, rendered=darker)])
+    assert both.core_psnr == pytest.approx((scores.core_psnr + PSNR_CEILING) / 2)
+    assert 0 < both.border_error_share < 1
+
+
+def test_a_hand_without_a_core_has_no_figure_for_it() -> None:
+    thin = torch.zeros(256, 256, dtype=torch.bool)
+    thin[100:104] = True
+    big = torch.rand(256, 256, 3, generator=torch.Generator().manual_seed(0))
+    scores = zone_scores([JudgedFrame(big, thin, big, thin.float())])
+    assert (scores.core_psnr, scores.core_share, scores.border_error_share) == (None, 0, 1)
+
+
+def test_exposure_multiplies_what_was_rendered_and_saturates() -> None:
+    color = torch.tensor([[0.2, 0.4, 0.9]])
+    gain = torch.tensor([0.5, 1.0, 1.5])
+    assert exposed(color, gain).tolist() == [pytest.approx([0.1, 0.4, 1.0])]
+
+
 def test_worst_share_takes_at_least_one_and_rounds_up() -> None:
     assert worst_mean([3.0, 1.0, 2.0], 0.05) == 1
     assert worst_mean([float(value) for value in range(20)], 0.05) == 0
@@ -201,11 +263,12 @@ def test_the_mean_color_is_the_best_single_color() -> None:
     color = mean_color(images, masks)
     pixels = torch.cat([images[0][masks[0]], images[1][masks[1]]])
     assert torch.allclose(color, pixels.mean(0))
-    coverages = [mask.float() for mask in masks[:1]]
-    best = mean_color_masked_psnr(color, images[:1], coverages)
-    assert best > mean_color_masked_psnr(color + 0.1, images[:1], coverages)
+    judged = JudgedFrame(torch.zeros(48, 40, 3), masks[1], images[0], masks[0].float())
+    best = mean_color_masked_psnr([color], [judged])
+    assert best > mean_color_masked_psnr([color + 0.1], [judged])
     plain = torch.ones(48, 40, 3) * torch.tensor([0.2, 0.4, 0.6])
-    assert mean_color_masked_psnr(plain[0, 0], [plain], coverages) == PSNR_CEILING
+    judged = JudgedFrame(plain, masks[0], plain, masks[0].float())
+    assert mean_color_masked_psnr([plain[0, 0]], [judged]) == PSNR_CEILING
 
 
 @settings(max_examples=20, deadline=None)

@@ -13,7 +13,9 @@ from handavatar.evaluate.report import (
     ERROR_CEILING,
     Curve,
     ReportRow,
+    contact_sheet,
     error_picture,
+    greyed,
     picture,
     write_report,
 )
@@ -72,6 +74,7 @@ def full_report(path: Path) -> str:
             "mask_iou": 0.95678,
             "paper": {"psnr": 31.234567, "lpips": None},
             "masked": {"psnr": float("nan")},
+            "protocol mask": {"core": {"psnr": 33.33}, "gain": {"mean": 2, "low": 1.5, "high": 3}},
             "perceptual": "lpips-vgg",
         },
         rows=rows,
@@ -84,7 +87,15 @@ def test_page_is_well_formed_and_shows_everything(tmp_path: Path) -> None:
     page = Page(full_report(tmp_path / "report.html"))
     for text in ("Avatar of a hand", "mask iou", "0.9568", "31.23", "frame 12 · 31.2 dB"):
         assert text in page.text
-    for text in ("LPIPS was not measured.", "PSNR, dB", "lpips-vgg", "illumination"):
+    for text in (
+        "core psnr",
+        "33.33",
+        "2 [1.5, 3]",
+        "LPIPS was not measured.",
+        "PSNR, dB",
+        "lpips-vgg",
+        "illumination",
+    ):
         assert text in page.text
     assert "nan" not in page.text.lower() and page.text.count("–") == 2
     assert page.tags.count("img") == 5
@@ -167,3 +178,25 @@ def test_error_picture_brightens_with_the_error() -> None:
     assert brightness[0] == 0
     assert (np.diff(brightness) >= 0).all()
     assert (np.diff(brightness[:33]) > 0).all()
+
+
+def test_unknown_pixels_are_grey() -> None:
+    known = torch.tensor([[True, False]])
+    pixels = np.array([[[1, 2, 3], [4, 5, 6]]], dtype=np.uint8)
+    assert greyed(pixels, known).tolist() == [[[1, 2, 3], [128, 128, 128]]]
+    assert pixels.tolist() == [[[1, 2, 3], [4, 5, 6]]]
+
+
+def test_the_sheet_holds_the_first_and_the_last_row_and_at_most_so_many() -> None:
+    rows = [
+        ReportRow(
+            f"row {n}",
+            {"a": np.full((20, 30, 3), n, np.uint8), "b": np.zeros((20, 30, 3), np.uint8)},
+        )
+        for n in range(40)
+    ]
+    sheet = contact_sheet(rows, {"b": "B", "a": "A"}, limit=12)
+    assert sheet.shape == (16 + 12 * 36, 60, 3)
+    values = [int(sheet[16 + 36 * place + 20, 45, 0]) for place in range(12)]
+    assert values[0] == 0 and values[-1] == 39 and values == sorted(set(values))
+    assert contact_sheet(rows[:3], {"a": "A"}).shape == (16 + 3 * 36, 30, 3)

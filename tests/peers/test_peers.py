@@ -10,10 +10,12 @@ from conftest import TINY, bent_pose
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame, read_capture
+from handavatar.evaluate import textured_mesh
 from handavatar.evaluate.metrics import mean_color
+from handavatar.evaluate.textured_mesh import fit_textured_mesh, harmonics
 from handavatar.field.shading import TracedCues
 from handavatar.hand.open_hand import load_open_hand
-from handavatar.peers import inverse_skinning, textured_mesh
+from handavatar.peers import inverse_skinning
 from handavatar.peers.inverse_skinning import (
     CanonicalField,
     fit_inverse_skinning,
@@ -24,7 +26,6 @@ from handavatar.peers.inverse_skinning import (
     some_rays,
 )
 from handavatar.peers.table import PeersTableOptions, peers_table
-from handavatar.peers.textured_mesh import fit_textured_mesh, harmonics
 from handavatar.render.rasterize import rasterize
 from handavatar.train.ablation import FrameScores
 from handavatar.train.loop import METHODS

@@ -6,7 +6,7 @@ black and round them to 8 bit first, as a file on disk would hold them.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,6 +21,9 @@ PSNR_CEILING = 100.0
 
 REGION_MARGIN = 8.0
 """Pixels around both masks that the masked protocol judges too."""
+
+CORE_DEPTH = 6 / 256
+"""Of the picture's width: deeper inside both masks lies the core, where no outline is judged."""
 
 _WINDOW_SIGMA = 1.5
 _WINDOW_RADIUS = 5
@@ -103,6 +106,29 @@ def quantised(image: Float[Tensor, "*pixels channels"]) -> Float[Tensor, "*pixel
     return (image.clamp(0, 1) * 255).round() / 255
 
 
+def exposed(
+    color: Float[Tensor, "*pixels 3"], gain: Float[Tensor, "3"]
+) -> Float[Tensor, "*pixels 3"]:
+    """A rendered picture as the camera exposed this frame: in sRGB, saturated at 1.
+
+    Args:
+        color: rendered, sRGB.
+        gain: by how much the frame is brighter than the capture's average, in the same encoding.
+    """
+    return (color * gain.to(color)).clamp(0, 1)
+
+
+def depth_inside(mask: Bool[Tensor, "height width"]) -> Float[Tensor, "height width"]:
+    """Distance of each pixel of the mask from the nearest one outside of it, pixels; 0 outside.
+
+    The picture's edge is no border: what lies beyond it is not known.
+    """
+    if bool(mask.all()):
+        return torch.full(mask.shape, math.inf, device=mask.device)
+    depth = distance_transform_edt(mask.cpu().numpy())
+    return torch.from_numpy(depth).float().to(mask.device)
+
+
 @dataclass(frozen=True, eq=False)
 class JudgedFrame:
     """A picture of the avatar beside the photograph of the same moment.
@@ -113,42 +139,82 @@ class JudgedFrame:
         truth: the photograph.
         truth_coverage: how much of each pixel of the photograph the hand covers, in [0, 1]. Its
             outline goes through pixels; black beside it is mixed in by as much.
+        known: false where nothing is known of the photograph; such pixels are black in both
+            pictures and count in no figure. All are known if it is left out.
     """
 
     rendered: Float[Tensor, "height width 3"]
     rendered_mask: Bool[Tensor, "height width"]
     truth: Float[Tensor, "height width 3"]
     truth_coverage: Float[Tensor, "height width"]
+    known: Bool[Tensor, "height width"] = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        """Everything is known where nothing else is said."""
+        if self.known is None:
+            object.__setattr__(self, "known", torch.ones_like(self.rendered_mask))
 
     @property
     def truth_mask(self) -> Bool[Tensor, "height width"]:
-        """Where the photograph shows more hand than background."""
-        return self.truth_coverage > 0.5
+        """Where the photograph is known to show more hand than background."""
+        return (self.truth_coverage > 0.5) & self.known
+
+    @property
+    def seen_mask(self) -> Bool[Tensor, "height width"]:
+        """The rendered mask where the photograph is known."""
+        return self.rendered_mask & self.known
 
     def on_black(self) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
-        """Both pictures as they are compared: the hand on black, 8 bit."""
-        return quantised(self.rendered), quantised(self.truth * self.truth_coverage[..., None])
+        """Both pictures as they are compared: the hand on black, 8 bit; what is unknown is black.
+
+        What the file holds at an unknown pixel, be it no number at all, is not looked at.
+        """
+        truth = self.truth * self.truth_coverage[..., None]
+        rendered, truth = (
+            torch.where(self.known[..., None], image, torch.zeros_like(image))
+            for image in (self.rendered, truth)
+        )
+        return quantised(rendered), quantised(truth)
 
     def region(self) -> Bool[Tensor, "height width"]:
-        """The union of both masks, dilated by ``REGION_MARGIN``.
+        """The known pixels of the union of both masks, dilated by ``REGION_MARGIN``.
 
         Raises:
             ValueError: if neither picture shows a hand.
         """
-        union = self.rendered_mask | self.truth_mask
+        union = self.seen_mask | self.truth_mask
         if not bool(union.any()):
             raise ValueError("neither the photograph nor the rendering shows a hand")
-        return dilated(union, REGION_MARGIN)
+        return dilated(union, REGION_MARGIN) & self.known
+
+    def core(self) -> Bool[Tensor, "height width"]:
+        """Pixels deeper than ``CORE_DEPTH`` inside both masks: no outline is judged there.
+
+        What is unknown is inside of neither. May be empty.
+        """
+        both = self.seen_mask & self.truth_mask
+        return depth_inside(both) > CORE_DEPTH * both.shape[1]
+
+    def painted(
+        self, color: Float[Tensor, "3"], coverage: Float[Tensor, "height width"]
+    ) -> "JudgedFrame":
+        """The same photograph beside one flat colour.
+
+        Args:
+            color: in [0, 1].
+            coverage: how much of each pixel is painted.
+        """
+        return replace(self, rendered=color * coverage[..., None], rendered_mask=coverage > 0.5)
 
 
 @dataclass(frozen=True)
 class PaperScores:
-    """Means over the frames of full pictures on black; the background inflates them.
+    """Means over the frames of all known pixels, on black; the background inflates them.
 
     Attributes:
         psnr: decibels.
         ssim: at most 1.
-        hand_share: share of the pixels that show the hand.
+        hand_share: share of the known pixels that show the hand.
     """
 
     psnr: float
@@ -178,11 +244,10 @@ def paper_scores(frames: Sequence[JudgedFrame]) -> PaperScores:
 
     Source: paper Sec. 4.1; background, 8 bit and averaging as in the authors' code.
     """
-    pairs = [frame.on_black() for frame in frames]
     return PaperScores(
-        psnr=_mean([psnr(rendered, truth) for rendered, truth in pairs]),
-        ssim=_mean([float(ssim(rendered, truth)) for rendered, truth in pairs]),
-        hand_share=_mean([float(frame.truth_mask.float().mean()) for frame in frames]),
+        psnr=_mean([region_psnr(frame, frame.known) for frame in frames]),
+        ssim=_mean([_mean_similarity(frame, frame.known) for frame in frames]),
+        hand_share=_mean([float(frame.truth_mask[frame.known].float().mean()) for frame in frames]),
     )
 
 
@@ -199,16 +264,30 @@ def masked_scores(frames: Sequence[JudgedFrame]) -> MaskedScores:
 
 def masked_psnr(frame: JudgedFrame) -> float:
     """Decibels over the pixels of the frame's region."""
+    return region_psnr(frame, frame.region())
+
+
+def region_psnr(frame: JudgedFrame, region: Bool[Tensor, "height width"]) -> float:
+    """Decibels over some pixels of a frame, as the pictures are compared; at least one."""
     rendered, truth = frame.on_black()
-    region = frame.region()
     return psnr(rendered[region], truth[region])
+
+
+def core_psnr(frame: JudgedFrame) -> float | None:
+    """Decibels over the frame's core; None where it has none."""
+    core = frame.core()
+    return region_psnr(frame, core) if bool(core.any()) else None
 
 
 def masked_ssim(frame: JudgedFrame) -> float:
     """Mean of the similarity map over the region, as far as its windows fit in the image."""
+    return _mean_similarity(frame, frame.region())
+
+
+def _mean_similarity(frame: JudgedFrame, region: Bool[Tensor, "height width"]) -> float:
     inner = slice(_WINDOW_RADIUS, -_WINDOW_RADIUS)
     similarity = ssim_map(*frame.on_black())
-    region = frame.region()[inner, inner]
+    region = region[inner, inner]
     return float(similarity[region].mean()) if bool(region.any()) else float(similarity.mean())
 
 
@@ -219,7 +298,47 @@ def masked_flip(frame: JudgedFrame) -> float:
 
 def mean_mask_iou(frames: Sequence[JudgedFrame]) -> float:
     """Mean over the frames of the masks' intersection over union."""
-    return _mean([mask_iou(frame.rendered_mask, frame.truth_mask) for frame in frames])
+    return _mean([mask_iou(frame.seen_mask, frame.truth_mask) for frame in frames])
+
+
+@dataclass(frozen=True)
+class ZoneScores:
+    """The core of the hand apart from its border.
+
+    Attributes:
+        core_psnr: decibels, mean over the frames that have a core; None if none has one.
+        border_psnr: decibels over the rest of the region, mean over the frames that have one.
+        core_share: share of the region's pixels that lie in the core, all frames together.
+        border_error_share: share of the squared error that lies in the border, all frames
+            together; 0 if there is no error.
+    """
+
+    core_psnr: float | None
+    border_psnr: float | None
+    core_share: float
+    border_error_share: float
+
+
+def zone_scores(frames: Sequence[JudgedFrame]) -> ZoneScores:
+    """The masked protocol's region, cut into core and border."""
+    borders, pixels, errors = [], [0, 0], [0.0, 0.0]
+    for frame in frames:
+        rendered, truth = frame.on_black()
+        error = (rendered.double() - truth.double()).square().sum(-1)
+        core = frame.core()
+        border = frame.region() & ~core
+        if bool(border.any()):
+            borders.append(region_psnr(frame, border))
+        for place, zone in enumerate((core, border)):
+            pixels[place] += int(zone.sum())
+            errors[place] += float(error[zone].sum())
+    cores = [value for value in map(core_psnr, frames) if value is not None]
+    return ZoneScores(
+        core_psnr=_mean(cores) if cores else None,
+        border_psnr=_mean(borders) if borders else None,
+        core_share=pixels[0] / sum(pixels),
+        border_error_share=errors[1] / sum(errors) if sum(errors) > 0 else 0.0,
+    )
 
 
 def worst_mean(values: Sequence[float], share: float) -> float:
@@ -236,24 +355,21 @@ def mean_color(
 
 
 def mean_color_masked_psnr(
-    color: Float[Tensor, "3"],
-    images: Sequence[Float[Tensor, "height width 3"]],
-    coverages: Sequence[Float[Tensor, "height width"]],
+    colors: Sequence[Float[Tensor, "3"]], frames: Sequence[JudgedFrame]
 ) -> float:
     """The baseline that knows the true mask and nothing else: one colour painted into it.
 
     Args:
-        color: :func:`mean_color` of the training frames.
-        images: the frames to be judged.
-        coverages: their true masks; see :class:`JudgedFrame`.
+        colors: :func:`mean_color` of the training frames, as each of the frames is exposed.
+        frames: to be judged; what was rendered plays no part.
 
     Returns:
         The masked protocol's PSNR, decibels.
     """
     return _mean(
         [
-            masked_psnr(JudgedFrame(color * coverage[..., None], coverage > 0.5, image, coverage))
-            for image, coverage in zip(images, coverages, strict=True)
+            masked_psnr(frame.painted(color, frame.truth_coverage))
+            for color, frame in zip(colors, frames, strict=True)
         ]
     )
 

@@ -10,11 +10,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
-from PIL import Image
+from jaxtyping import Bool, Float, UInt8
+from PIL import Image, ImageDraw
 from torch import Tensor
 
 from handavatar.geometry.colors import eight_bits
@@ -22,6 +23,9 @@ from handavatar.jobs.files import write_atomically
 
 Metric = float | int | str | bool | None
 """A figure; ``None`` was not measured."""
+
+Figures = Metric | Mapping[str, Any]
+"""A figure, or a group of figures and groups."""
 
 ERROR_CEILING = 0.25
 """The error, of colours in [0, 1], that the error picture paints brightest."""
@@ -60,7 +64,7 @@ class Curve:
 def write_report(
     path: Path,
     title: str,
-    metrics: Mapping[str, Metric | Mapping[str, Metric]],
+    metrics: Mapping[str, Figures],
     rows: Sequence[ReportRow] = (),
     curves: Sequence[Curve] = (),
     notes: Sequence[str] = (),
@@ -71,7 +75,8 @@ def write_report(
     Args:
         path: the file; its folder must exist.
         title: heading, plain text like all the others.
-        metrics: figures by name, at most one level deep; a group becomes a block of its own.
+        metrics: figures by name; a group becomes a block of its own, and what is a group in it
+            lines with longer names. ``mean``, ``low`` and ``high`` are printed as an interval.
         rows: frames with their pictures.
         curves: charts; those with fewer than two points are left out.
         notes: what a reader must know to judge the figures.
@@ -116,6 +121,44 @@ def error_picture(
     return np.stack(channels, axis=-1).round().astype(np.uint8)
 
 
+def greyed(
+    pixels: UInt8[np.ndarray, "height width 3"], known: Bool[Tensor, "height width"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """The picture with a middle grey where nothing is known."""
+    shown = pixels.copy()
+    shown[~known.cpu().numpy()] = 128
+    return shown
+
+
+def contact_sheet(
+    rows: Sequence[ReportRow], columns: Mapping[str, str], limit: int = 12
+) -> UInt8[np.ndarray, "height width 3"]:
+    """One picture of frames below each other, captions above them.
+
+    Args:
+        rows: with colour pictures of one size, at least one row.
+        columns: which pictures, with their headings.
+        limit: of more rows so many are shown, evenly spread, the first and the last among them.
+    """
+    places = np.unique(np.linspace(0, len(rows) - 1, min(limit, len(rows))).round().astype(int))
+    chosen = [rows[place] for place in places]
+    height, width = next(iter(chosen[0].pictures.values())).shape[:2]
+    sheet = Image.new("RGB", (width * len(columns), _LINE + (height + _LINE) * len(chosen)))
+    draw = ImageDraw.Draw(sheet)
+    for place, heading in enumerate(columns.values()):
+        draw.text((place * width + 4, 2), heading, fill=(255, 255, 255))
+    for number, row in enumerate(chosen):
+        top = _LINE + number * (height + _LINE)
+        draw.text((4, top + 2), row.caption, fill=(200, 200, 200))
+        for place, name in enumerate(columns):
+            pixels = np.ascontiguousarray(row.pictures[name])
+            sheet.paste(Image.fromarray(pixels), (place * width, top + _LINE))
+    return np.asarray(sheet)
+
+
+_LINE = 16
+"""Pixels of a line of text in the sheet."""
+
 _HEAT = ((0, 0, 0), (62, 18, 92), (150, 38, 90), (226, 92, 42), (250, 176, 48), (255, 250, 205))
 
 
@@ -123,12 +166,12 @@ def _section(heading: str, content: str, tag: str = "div") -> str:
     return f"<section><h2>{heading}</h2><{tag}>{content}</{tag}></section>" if content else ""
 
 
-def _metrics_html(metrics: Mapping[str, Metric | Mapping[str, Metric]]) -> str:
+def _metrics_html(metrics: Mapping[str, Figures]) -> str:
     """Single figures first, in one block; then a block for every group."""
     single = {name: value for name, value in metrics.items() if not isinstance(value, Mapping)}
     groups = {name: value for name, value in metrics.items() if isinstance(value, Mapping)}
     blocks = [("", single)] if single else []
-    blocks += [(name, dict(group)) for name, group in groups.items() if group]
+    blocks += [(name, _flattened(group)) for name, group in groups.items() if group]
     tables = []
     for name, block in blocks:
         caption = f"<caption>{escape(_words(name))}</caption>" if name else ""
@@ -138,6 +181,20 @@ def _metrics_html(metrics: Mapping[str, Metric | Mapping[str, Metric]]) -> str:
         )
         tables.append(f"<table>{caption}{lines}</table>")
     return f'<div class="tables">{"".join(tables)}</div>' if tables else ""
+
+
+def _flattened(group: Mapping[str, Any], before: str = "") -> dict[str, Metric]:
+    """Groups within a group as lines with longer names; an interval is one line."""
+    lines: dict[str, Metric] = {}
+    for name, value in group.items():
+        if isinstance(value, Mapping) and value.keys() == {"mean", "low", "high"}:
+            mean, low, high = (_figure(value[key]) for key in ("mean", "low", "high"))
+            lines[before + name] = f"{mean} [{low}, {high}]"
+        elif isinstance(value, Mapping):
+            lines |= _flattened(value, f"{before}{name} ")
+        else:
+            lines[before + name] = value
+    return lines
 
 
 def _words(name: str) -> str:

@@ -1,33 +1,45 @@
 """Judges a trained avatar on the held-out frames of its capture."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
 from handavatar.alignment import aligned_pose
+from handavatar.animate import VideoWriter
 from handavatar.avatar import HandAvatar, Rendering, chosen_device
 from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
+from handavatar.evaluate.baselines import judged_frame, textured_mesh_psnr, training_color
+from handavatar.evaluate.figures import protocol_figures
 from handavatar.evaluate.metrics import (
     JudgedFrame,
     albedo_psnr,
     masked_psnr,
-    masked_scores,
-    mean_color,
     mean_color_masked_psnr,
-    mean_mask_iou,
     paper_scores,
     shading_correlation,
 )
 from handavatar.evaluate.perceptual import LpipsVgg, perceptual_loss
-from handavatar.evaluate.report import Curve, ReportRow, error_picture, picture, write_report
+from handavatar.evaluate.registered import registered_pose
+from handavatar.evaluate.report import (
+    Curve,
+    ReportRow,
+    contact_sheet,
+    error_picture,
+    greyed,
+    picture,
+    write_report,
+)
 from handavatar.hand.pose import HandPose
 from handavatar.jobs.files import FolderKind, claim_folder
+from handavatar.render.rasterize import covered_pixels
 
 
 def _is_older_evaluation(folder: Path) -> bool:
@@ -36,7 +48,7 @@ def _is_older_evaluation(folder: Path) -> bool:
 
 
 EVALUATION = FolderKind(
-    "evaluation", ("*.png", "metrics.json", "report.html"), _is_older_evaluation
+    "evaluation", ("*.png", "metrics.json", "report.html", "own_motion.mp4"), _is_older_evaluation
 )
 """The folder that :func:`evaluate_run` writes into."""
 
@@ -63,11 +75,23 @@ class EvaluateOptions:
     device: str = "auto"
 
 
-def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
-    """Renders the split and measures it; writes pictures and a report.
+@dataclass(frozen=True, eq=False)
+class _Protocol:
+    """Everything of the judged frames when their poses are found in one way."""
 
-    Poses of captures made from videos are first fitted to the frame's mask (never to its
-    colours), since the training never saw these frames.
+    poses: list[HandPose]
+    renderings: list[Rendering]
+    judged: list[JudgedFrame]
+
+
+def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
+    """Renders the split and measures it; writes pictures, a report, a sheet and a film.
+
+    Captures whose poses are known are judged in these (protocol ``known``). Of those made from
+    videos every frame is judged twice: with its pose fitted to the mask and never to the colours
+    (``mask``: how well the avatar is driven), and with this pose drawn to the colours, the avatar
+    frozen (``registered``: how well it can look). The figures outside of ``protocols`` are those
+    of ``known`` or ``mask``.
 
     Returns:
         The object that ``handavatar evaluate --json`` prints.
@@ -88,36 +112,49 @@ def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
             "name another split with --split",
         )
     claim_folder(out, EVALUATION)
-    is_tracked = capture.is_tracked
     frames = [capture.frame(index) for index in indices]
-    renderings, judged = [], []
-    for frame in frames:
-        pose = frame.pose
-        if is_tracked:
-            pose = held_out_pose(avatar, frame)
-        rendering = _on_cpu(avatar.render(pose, frame.camera))
-        renderings.append(rendering)
-        judged.append(
-            JudgedFrame(
-                rendering.color.clamp(0, 1),
-                rendering.alpha > 0.5,
-                frame.image.float() / 255,
-                frame.alpha,
-            )
-        )
-    metrics = _measured(options, capture, frames, renderings, judged)
-    if is_tracked:
-        metrics["notes"].append("poses of the judged frames were fitted to their masks")
-    _write(out, metrics, capture, frames, renderings, judged, options)
+    protocols = _protocols(avatar, frames, capture.is_tracked)
+    metrics = _measured(options, capture, avatar, frames, protocols)
+    _write(out, metrics, capture, frames, protocols, options)
     return metrics
 
 
+def _protocols(avatar: HandAvatar, frames: list[Frame], is_tracked: bool) -> dict[str, _Protocol]:
+    """By name; the first one is that of the figures outside of ``protocols``."""
+    if not is_tracked:
+        return {"known": _rendered(avatar, frames, [frame.pose for frame in frames])}
+    fitted = _rendered(avatar, frames, [held_out_pose(avatar, frame) for frame in frames])
+    poses = [
+        registered_pose(avatar, frame, pose, rendering)
+        for frame, pose, rendering in zip(frames, fitted.poses, fitted.renderings, strict=True)
+    ]
+    return {"mask": fitted, "registered": _rendered(avatar, frames, poses)}
+
+
+def _rendered(avatar: HandAvatar, frames: list[Frame], poses: list[HandPose]) -> _Protocol:
+    renderings = [
+        _on_cpu(avatar.render(pose, frame.camera))
+        for frame, pose in zip(frames, poses, strict=True)
+    ]
+    judged = [
+        judged_frame(frame, rendering.color, rendering.alpha)
+        for frame, rendering in zip(frames, renderings, strict=True)
+    ]
+    return _Protocol(poses, renderings, judged)
+
+
 def held_out_pose(avatar: HandAvatar, frame: Frame) -> HandPose:
-    """Training corrects the poses of its own frames; held-out frames get the same chance."""
+    """Training corrects the poses of its own frames; held-out frames get the same chance.
+
+    Where nothing is known, the outline is taken to be that of the tracked pose.
+    """
     device = avatar.device
-    return aligned_pose(
-        avatar.coarse_personal, frame.pose.to(device), frame.camera.to(device), frame.alpha
-    )
+    pose, camera, coverage = frame.pose.to(device), frame.camera.to(device), frame.alpha
+    if not bool(frame.known.all()):
+        posed = avatar.coarse_personal(pose).posed(pose)
+        covered = covered_pixels(posed.vertices, posed.rig.faces, camera).cpu()
+        coverage = torch.where(frame.known, coverage, covered.float())
+    return aligned_pose(avatar.coarse_personal, pose, camera, coverage)
 
 
 def _opened(options: EvaluateOptions) -> tuple[HandAvatar, Capture, Path]:
@@ -152,52 +189,133 @@ def _on_cpu(rendering: Rendering) -> Rendering:
 def _measured(
     options: EvaluateOptions,
     capture: Capture,
+    avatar: HandAvatar,
     frames: list[Frame],
-    renderings: list[Rendering],
-    judged: list[JudgedFrame],
+    protocols: dict[str, _Protocol],
 ) -> dict[str, Any]:
-    notes = []
-    paper, masked = paper_scores(judged), masked_scores(judged)
+    notes: list[str] = []
+    name, main = next(iter(protocols.items()))
     distance = perceptual_loss("auto")
-    pairs = [frame.on_black() for frame in judged]
+    pairs = [frame.on_black() for frame in main.judged]
     perceptual = [float(distance(rendered[None], truth[None])) for rendered, truth in pairs]
     value = sum(perceptual) / len(perceptual)
     is_lpips = isinstance(distance, LpipsVgg)
     if not is_lpips:
         notes.append(f"paper.lpips: null, its weights are not here; {distance.name}: {value:.4f}")
-    truth = _against_truth(capture, frames, renderings)
+    truth = _against_truth(capture, frames, main.renderings)
     if truth is None:
         notes.append("truth: null, the capture knows neither albedo nor shading of these frames")
-    training = [capture.frame(index) for index in capture.split("train")]
-    color = mean_color(
-        [frame.image.float() / 255 for frame in training], [frame.mask for frame in training]
-    )
-    baseline = mean_color_masked_psnr(
-        color,
-        [frame.image.float() / 255 for frame in frames],
-        [frame.alpha for frame in frames],
-    )
+    color = training_color(capture)
+    colors = [] if color is None else [(color * frame.gain).clamp(0, 1) for frame in frames]
+    times = torch.tensor([frame.time for frame in frames], dtype=torch.float64)
+    figures = {
+        key: protocol_figures(protocol.judged, times, colors) for key, protocol in protocols.items()
+    }
+    paper = paper_scores(main.judged)
+    notes += _POSE_NOTES[name]
     return {
         "split": options.split,
         "frames": len(frames),
+        "dropped": dropped_frames(capture.folder, options.split),
         "hand_share": paper.hand_share,
         "paper": {
             "psnr": paper.psnr,
             "ssim": paper.ssim,
             "lpips": value if is_lpips else None,
         },
-        "masked": {
-            "psnr": masked.psnr,
-            "ssim": masked.ssim,
-            "flip": masked.flip,
-            "worst5_psnr": masked.worst5_psnr,
+        "protocol": name,
+        **{key: figures[name][key] for key in _OUTSIDE},
+        "inside": {
+            "psnr": figures[name]["masked"]["psnr"],
+            "unknown_share": sum(float((~frame.known).float().mean()) for frame in frames)
+            / len(frames),
         },
-        "mask_iou": mean_mask_iou(judged),
-        "baseline": {"mean_color_masked_psnr": baseline},
+        "baseline": _baseline(avatar, capture, frames, main, color, colors, notes),
+        "protocols": figures,
         "truth": truth,
         "perceptual": distance.name,
         "notes": notes,
     }
+
+
+_OUTSIDE = ("masked", "core", "border", "detail", "mask_iou", "intervals")
+_POSE_NOTES = {
+    "known": ["poses are those of the capture, which knows them"],
+    "mask": [
+        "poses of the judged frames were fitted to their masks (protocol mask), and from there to "
+        "their colours with the avatar frozen (protocol registered); the latter says how well the "
+        "avatar can look, not how well it is driven",
+        "mask_iou of poses that were fitted to masks is no evidence of right poses",
+    ],
+}
+
+
+def _baseline(
+    avatar: HandAvatar,
+    capture: Capture,
+    frames: list[Frame],
+    main: _Protocol,
+    color: Float[Tensor, "3"] | None,
+    colors: Sequence[Float[Tensor, "3"]],
+    notes: list[str],
+) -> dict[str, float | None]:
+    """What the avatar has to beat, by the masked protocol."""
+    if color is None:
+        notes.append("baseline: null, the capture has no training frames to learn a colour from")
+        return dict.fromkeys(_BASELINES)
+    own = [
+        frame.painted(flat, rendering.alpha)
+        for frame, flat, rendering in zip(main.judged, colors, main.renderings, strict=True)
+    ]
+
+    def pose_of(frame: Frame) -> HandPose:
+        return held_out_pose(avatar, frame) if capture.is_tracked else frame.pose
+
+    figures = (
+        mean_color_masked_psnr(colors, main.judged),
+        sum(map(masked_psnr, own)) / len(own),
+        textured_mesh_psnr(avatar, capture, color, frames, main.poses, pose_of),
+    )
+    return dict(zip(_BASELINES, figures, strict=True))
+
+
+_BASELINES = ("mean_color_masked_psnr", "mean_color_own_mask_psnr", "textured_mesh_masked_psnr")
+
+
+def dropped_frames(folder: Path, split: str) -> dict[str, int | None]:
+    """How many frames the capture left out, since they could not be fitted or trusted.
+
+    Args:
+        folder: of the capture; its ``fit.json`` and ``skipped.json`` are read if they are there.
+        split: whose frames were judged.
+
+    Returns:
+        ``split``: of this split, where the capture fixed its splits before it dropped anything;
+        ``capture``: of all. None for what the capture does not say.
+    """
+    of_split: int | None = None
+    for name in ("fit.json", "skipped.json"):
+        splits = _object(folder / name).get("splits")
+        found = splits.get(split) if isinstance(splits, dict) else None
+        if isinstance(found, dict):
+            found = next((found[key] for key in _DROPPED if key in found), None)
+        if isinstance(found, int) and of_split is None:
+            of_split = found
+    is_there = (folder / "skipped.json").is_file()
+    reasons = {key for key in _object(folder / "skipped.json") if key != "splits"}
+    return {"split": of_split, "capture": len(reasons) if is_there else None}
+
+
+_DROPPED = ("dropped", "skipped", "left_out")
+
+
+def _object(path: Path) -> dict[str, Any]:
+    """A JSON file's object; an empty one if there is none."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return content if isinstance(content, dict) else {}
 
 
 def _against_truth(
@@ -248,29 +366,80 @@ def _write(
     metrics: dict[str, Any],
     capture: Capture,
     frames: list[Frame],
-    renderings: list[Rendering],
-    judged: list[JudgedFrame],
+    protocols: dict[str, _Protocol],
     options: EvaluateOptions,
 ) -> None:
-    rows = []
-    for frame, rendering, pair in zip(frames, renderings, judged, strict=True):
-        rendered, truth = pair.on_black()
-        pictures = {"truth": picture(truth), **pictures_of(rendering)}
-        pictures["error"] = error_picture(rendered, truth)
-        rows.append(ReportRow(f"{frame.name}  {masked_psnr(pair):.1f} dB masked", pictures))
+    name, main = next(iter(protocols.items()))
+    ratios, rows = [], []
+    for place, frame in enumerate(frames):
+        pictures = _strip(frame, main, place)
         strip = np.concatenate(list(pictures.values()), axis=1)
         Image.fromarray(strip).save(out / f"{frame.name}.png")
+        said = [f"{key} {masked_psnr(of.judged[place]):.1f}" for key, of in protocols.items()]
+        for key, of in protocols.items():
+            if of is not main:
+                pictures[key] = _strip(frame, of, place)["rendered"]
+        ratios.append(masked_psnr(main.judged[place]))
+        rows.append(ReportRow(f"{frame.name}  {', '.join(said)} dB masked", pictures))
+    order = sorted(range(len(rows)), key=lambda place: -ratios[place])
+    rows = [rows[place] for place in order]
+    Image.fromarray(contact_sheet(rows, _SHEET)).save(out / "sheet.png")
+    if capture.is_tracked:
+        _film(out / "own_motion.mp4", capture, frames, main)
     (out / "metrics.json").write_text(json.dumps(metrics, indent=2))
-    figures = {name: value for name, value in metrics.items() if name != "notes"}
+    figures = {key: value for key, value in metrics.items() if key not in ("notes", "protocols")}
+    figures |= {f"protocol_{key}": value for key, value in metrics["protocols"].items()}
+    for key in (*_OUTSIDE, "protocol"):
+        del figures[key]
     write_report(
         out / "report.html",
         title=f"Avatar of {capture.subject or capture.folder.name}",
-        subtitle=f"{metrics['frames']} held-out frames of {capture.folder.name}",
-        metrics={name: value for name, value in figures.items() if value is not None},
+        subtitle=f"{metrics['frames']} held-out frames of {capture.folder.name}, best to worst by "
+        f"protocol {name}; grey: nothing is known there",
+        metrics={key: value for key, value in figures.items() if value is not None},
         rows=rows,
         curves=_curves(options.run),
         notes=metrics["notes"],
     )
+
+
+_SHEET = {
+    "truth": "truth",
+    "rendered": "avatar",
+    "albedo": "albedo",
+    "illumination": "light",
+    "error": "error",
+}
+"""Columns of the sheet, with their headings."""
+
+
+def _strip(frame: Frame, protocol: _Protocol, place: int) -> dict[str, np.ndarray]:
+    """The pictures of a frame; what is compared is grey where nothing is known."""
+    rendered, truth = protocol.judged[place].on_black()
+    pictures = {"truth": picture(truth), **pictures_of(protocol.renderings[place])}
+    pictures["rendered"] = picture(rendered)
+    pictures["error"] = error_picture(rendered, truth)
+    compared = ("truth", "rendered", "error")
+    return pictures | {key: greyed(pictures[key], frame.known) for key in compared}
+
+
+def _film(path: Path, capture: Capture, frames: list[Frame], protocol: _Protocol) -> None:
+    """The photographs beside the avatar in the hand's own motion, blocks of time one by one."""
+    order = sorted(range(len(frames)), key=lambda place: frames[place].time)
+    times = torch.tensor([frames[place].time for place in order], dtype=torch.float64)
+    steps = times.diff()
+    steps = steps[steps > 0]
+    fps = 1 / float(steps.median()) if len(steps) else 1.0
+    side = frames[0].camera.width
+    writer = VideoWriter(path, min(max(fps, 1.0), 60.0), frames[0].camera.height, 2 * side)
+    for place in order:
+        frame = frames[place]
+        shown = [frame.image.numpy(), picture(protocol.judged[place].rendered)]
+        shown = [greyed(pixels, frame.known) for pixels in shown]
+        if capture.side == "left":
+            shown = [pixels[:, ::-1] for pixels in shown]
+        writer.add(np.concatenate(shown, axis=1))
+    writer.close()
 
 
 def _curves(run: Path) -> list[Curve]:

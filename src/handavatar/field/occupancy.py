@@ -20,10 +20,10 @@ from torch import Tensor, nn
 
 from handavatar.field.kernels import PRECISIONS, Kernel, Precision, settled_kernel
 from handavatar.field.layers import PointNet, SkipMLP
-from handavatar.jobs.threads import mapped
 from handavatar.hand.parts import PartBoxes, Parts
 from handavatar.hand.pose import CONNECTED_PAIRS, NUM_BONES
 from handavatar.hand.rig import PosedHand
+from handavatar.jobs.threads import mapped
 
 if TYPE_CHECKING:
     from handavatar.field.fused import Decided, PackedHand, PackedWeights

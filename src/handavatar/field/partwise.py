@@ -22,10 +22,10 @@ from handavatar.field.occupancy import (
     local_points,
     soft_occupancy,
 )
-from handavatar.jobs.threads import mapped
 from handavatar.field.transformer import TransformerDecoder
 from handavatar.hand.parts import Parts
 from handavatar.hand.rig import PosedHand
+from handavatar.jobs.threads import mapped
 
 
 @dataclass(frozen=True, eq=False)

@@ -148,14 +148,25 @@ def linearise_frame(
     hand = rest_with_pose(points.hand, pose)
     skeleton = Skeleton.of(hand, pose, points.space.joint_directions)
     vertices = skeleton.positions(
-        RestPoints(hand.rest_vertices, hand.rig.skin_weights, hand.rest_vertices[..., None][..., :0])
+        RestPoints(
+            hand.rest_vertices, hand.rig.skin_weights, hand.rest_vertices[..., None][..., :0]
+        )
     )
     total = _Sum(NUM_UNKNOWNS + points.num_shared)
     _add_outlines(total, points, hand, skeleton, vertices, seen, blurred, outlier, options)
     if colors is not None:
         _add_colors(
-            total, points, hand, skeleton, vertices, seen.picture, blurred, colors, color_error,
-            sigma, options,
+            total,
+            points,
+            hand,
+            skeleton,
+            vertices,
+            seen.picture,
+            blurred,
+            colors,
+            color_error,
+            sigma,
+            options,
         )
     if seen.landmarks is not None:
         _add_landmarks(total, points, skeleton, seen.picture.camera, seen.landmarks, options)
@@ -324,7 +335,10 @@ def _add_landmarks(
     distance = apart.norm(dim=-1, keepdim=True).expand(-1, 2)
     ones = torch.ones(2 * len(apart))
     total.add(
-        apart.flatten(), in_picture.flatten(0, 1), ones, options.landmark_outlier,
+        apart.flatten(),
+        in_picture.flatten(0, 1),
+        ones,
+        options.landmark_outlier,
         distance.flatten(),
     )
     sight = camera.camera_from_world[2, :3]

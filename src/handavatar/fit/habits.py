@@ -41,7 +41,10 @@ def habit_residuals(
         turned = matrix_from_axis_angle(rotations) @ matrix_from_axis_angle(turns)
         angles = angles_from_rotations(rig, axis_angle_from_matrix(turned))
         slopes = torch.stack(
-            [torch.autograd.grad(angles[..., i].sum(), turns, retain_graph=True)[0] for i in range(3)],
+            [
+                torch.autograd.grad(angles[..., i].sum(), turns, retain_graph=True)[0]
+                for i in range(3)
+            ],
             dim=2,
         )
         angles = angles.detach()

@@ -29,9 +29,7 @@ def moved_pose(pose: HandPose, change: Float[Tensor, "*batch 51"]) -> HandPose:
 
 def pose_difference(start: HandPose, end: HandPose) -> Float[Tensor, "*batch 51"]:
     """The change that moves one pose to another; inverse of :func:`moved_pose`."""
-    between = (
-        matrix_from_axis_angle(start.rotations).mT @ matrix_from_axis_angle(end.rotations)
-    )
+    between = matrix_from_axis_angle(start.rotations).mT @ matrix_from_axis_angle(end.rotations)
     turns = axis_angle_from_matrix(between).flatten(-2)
     return torch.cat([turns, end.translation - start.translation], dim=-1)
 
@@ -52,9 +50,7 @@ class RestPoints:
 
     def select(self, index: Int[Tensor, "selected"]) -> "RestPoints":
         """Some of the points."""
-        return RestPoints(
-            self.positions[index], self.skin_weights[index], self.directions[index]
-        )
+        return RestPoints(self.positions[index], self.skin_weights[index], self.directions[index])
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,9 +20,7 @@ _TOLERANCES = {"wrist": 0.010, "cmc": 0.008, "mcp": 0.006, "tip": 0.004}
 _TOLERANCE = 0.003
 
 
-def landmark_rest(
-    hand: ShapedHand, space: ShapeSpace, offsets: Float[Tensor, "63"]
-) -> RestPoints:
+def landmark_rest(hand: ShapedHand, space: ShapeSpace, offsets: Float[Tensor, "63"]) -> RestPoints:
     """The landmarks in the zero pose; unknowns are those of the shape, and then the offsets.
 
     Args:

@@ -138,6 +138,8 @@ def blur(
     kernel = torch.exp(-0.5 * (offsets / sigma).square())
     kernel = kernel / kernel.sum()
     planes = image.permute(2, 0, 1)[:, None]
-    planes = conv2d(pad(planes, (0, 0, reach, reach), mode="replicate"), kernel[None, None, :, None])
+    planes = conv2d(
+        pad(planes, (0, 0, reach, reach), mode="replicate"), kernel[None, None, :, None]
+    )
     planes = conv2d(pad(planes, (reach, reach, 0, 0), mode="replicate"), kernel[None, None, None])
     return planes[:, 0].permute(1, 2, 0)

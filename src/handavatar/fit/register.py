@@ -14,8 +14,8 @@ from torch import Tensor
 
 from handavatar.fit.appearance import SkinColors, fit_colors
 from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
-from handavatar.fit.landmarks import landmark_rest, offset_tolerances
 from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, moved_pose, pose_difference
+from handavatar.fit.landmarks import landmark_rest, offset_tolerances
 from handavatar.fit.pictures import FramePicture
 from handavatar.fit.shape import ShapeSpace, fixed_shape
 from handavatar.fit.solver import Descent, Look
@@ -133,9 +133,7 @@ def register(
     """
     report = progress or (lambda share: None)
     rig = hand.rig
-    space = (
-        ShapeSpace.around(rig, options.coefficient_sigma) if learns_shape else fixed_shape(rig)
-    )
+    space = ShapeSpace.around(rig, options.coefficient_sigma) if learns_shape else fixed_shape(rig)
     generator = torch.Generator().manual_seed(options.seed)
     surface = sample_surface_evenly(rig.template_vertices, rig.faces, _NUM_POINTS, generator)
     none = RestPoints(torch.zeros(0, 3), torch.zeros(0, 16), torch.zeros(0, 3, 0))
@@ -212,9 +210,7 @@ def colored_look(descent: Descent, sigma: float) -> Look:
     return replace(look, colors=colors, color_error=max(error, _LEAST_COLOR_ERROR))
 
 
-def begin_anew(
-    descent: Descent, look: Look, generator: torch.Generator, is_near: bool
-) -> None:
+def begin_anew(descent: Descent, look: Look, generator: torch.Generator, is_near: bool) -> None:
     """Tries badly explained frames from other poses, and keeps what explains them better.
 
     Args:

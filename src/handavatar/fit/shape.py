@@ -33,7 +33,9 @@ class ShapeSpace:
     sigmas: Float[Tensor, "shapes"]
 
     @staticmethod
-    def around(rig: Rig, coefficient_sigma: float, num_swellings: int = NUM_SWELLINGS) -> "ShapeSpace":
+    def around(
+        rig: Rig, coefficient_sigma: float, num_swellings: int = NUM_SWELLINGS
+    ) -> "ShapeSpace":
         """The rig's shape coefficients and, along the normals, the smoothest waves on its mesh.
 
         Args:

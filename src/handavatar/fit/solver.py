@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from handavatar.jobs.threads import mapped
 from handavatar.fit.appearance import SeenColors, SkinColors, see_colors
 from handavatar.fit.energy import (
     EnergyOptions,
@@ -25,7 +24,7 @@ from handavatar.fit.kinematics import NUM_UNKNOWNS, moved_pose, pose_difference
 from handavatar.fit.motion import MotionTerms, motion_terms, solve_chain
 from handavatar.fit.pictures import BlurredPicture
 from handavatar.hand.pose import HandPose
-from handavatar.hand.rig import ShapedHand
+from handavatar.jobs.threads import mapped
 
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e4
 _LONGEST_TURN = 0.35
@@ -181,9 +180,7 @@ class Descent:
         factor = torch.where(is_better, _FURTHER, _BACK)
         self.damping = (self.damping * factor).clamp(_LEAST_DAMPING, _MOST_DAMPING)
 
-    def _linearised(
-        self, look: Look, poses: HandPose, shared: Float[Tensor, "shared"]
-    ) -> "_Whole":
+    def _linearised(self, look: Look, poses: HandPose, shared: Float[Tensor, "shared"]) -> "_Whole":
         def linearised(frame: int) -> Linearised:
             return linearise_frame(
                 self.points_of(shared, frame),

@@ -14,13 +14,13 @@ from torch import Tensor, nn
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
+from handavatar.evaluate.descent import descend
 from handavatar.field.anchors import nearest_anchors
 from handavatar.field.layers import MLP, positional_encoding
 from handavatar.field.shading import POSITION_SCALE
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, ShapedHand
-from handavatar.peers.descent import descend
 from handavatar.render.rasterize import covered_pixels
 from handavatar.render.volume import composite_sparse, visibility
 

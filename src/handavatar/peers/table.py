@@ -15,9 +15,9 @@ from handavatar.capture.checks import load_json
 from handavatar.capture.frames import Frame, read_capture
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable, step_counter
+from handavatar.evaluate.textured_mesh import RAYS, fit_textured_mesh
 from handavatar.jobs.files import make_folder
 from handavatar.peers.inverse_skinning import fit_inverse_skinning
-from handavatar.peers.textured_mesh import RAYS, fit_textured_mesh
 from handavatar.train.ablation import (
     ROWS,
     FittedGeometry,

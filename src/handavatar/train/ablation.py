@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from handavatar.avatar import START_LIGHT, HandAvatar, HandState, RenderSettings
 from handavatar.capture.frames import Capture, Frame, read_capture
 from handavatar.capture.synthetic import crop_camera
+from handavatar.evaluate.baselines import judged_frame
 from handavatar.evaluate.metrics import (
     JudgedFrame,
     albedo_psnr,
@@ -572,7 +573,7 @@ class FrameScores:
         alpha: Float[Tensor, "height width"],
     ) -> JudgedFrame:
         """Judges a picture on black against a frame."""
-        pair = JudgedFrame(color.clamp(0, 1), alpha > 0.5, frame.image.float() / 255, frame.alpha)
+        pair = judged_frame(frame, color, alpha)
         rendered, truth = pair.on_black()
         self.by_name["psnr"].append(masked_psnr(pair))
         self.by_name["ssim"].append(masked_ssim(pair))

@@ -13,8 +13,8 @@ from torch import Tensor
 from handavatar.avatar import HandAvatar, RenderSettings
 from handavatar.capture.frames import Frame
 from handavatar.field.occupancy import HandCodes
-from handavatar.jobs.threads import mapped
 from handavatar.geometry.cameras import Rays, pixel_centers, rays_through_pixels
+from handavatar.jobs.threads import mapped
 from handavatar.render.silhouette import signed_distance
 from handavatar.train.losses import border_loss
 from handavatar.train.pretraining import descend

@@ -14,11 +14,11 @@ from handavatar.alignment import aligned_pose
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
 from handavatar.field.shape import personal_hand
-from handavatar.jobs.threads import mapped
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import unique_edges
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, Rig
+from handavatar.jobs.threads import mapped
 from handavatar.render.silhouette import silhouette_loss, soft_mask, soft_silhouette
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.losses import offset_loss

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from handavatar.avatar import HandAvatar
 from handavatar.field.occupancy import HandCodes
-from handavatar.jobs.threads import mapped
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.pose import HandPose
+from handavatar.jobs.threads import mapped
 from handavatar.train.labelled_poses import training_points
 from handavatar.train.pretraining import OccupancyLoss, descend
 from handavatar.train.stage_times import StageTimes

@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
+from handavatar.evaluate.descent import descend
 from handavatar.field.anchors import Neighbours, nearest_anchors
 from handavatar.geometry.meshes import SurfacePoints, sample_surface, vertex_normals
-from handavatar.peers.descent import descend
 from handavatar.render.rasterize import interpolate, rasterize
 
 NUM_TEXELS = 30_000
@@ -73,46 +73,60 @@ class MeshPoints:
 
 
 @torch.no_grad()
-def mesh_points(avatar: HandAvatar, texels: SurfacePoints, frame: Frame) -> MeshPoints:
-    """Rasterises the personal mesh in the frame's pose."""
-    posed = avatar.personal(frame.pose).posed(frame.pose)
-    camera = frame.camera
-    fine = camera.resized(RAYS * camera.width, RAYS * camera.height)
+def mesh_points(
+    avatar: HandAvatar, texels: SurfacePoints, frame: Frame, rays: int = RAYS
+) -> MeshPoints:
+    """Rasterises the personal mesh in the frame's pose, ``rays`` a pixel in each direction."""
+    pose, camera = frame.pose.to(avatar.device), frame.camera.to(avatar.device)
+    posed = avatar.personal(pose).posed(pose)
+    fine = camera.resized(rays * camera.width, rays * camera.height)
     fragments = rasterize(posed.vertices, avatar.rig.faces, fine)
     y, x = fragments.mask.nonzero().unbind(-1)
     normals = vertex_normals(posed.vertices, avatar.rig.faces)
     values = torch.cat([posed.vertices, normals], dim=-1)
     found = interpolate(fragments, avatar.rig.faces, values)[y, x]
     neighbours = nearest_anchors(texels.positions(posed.vertices), found[:, :3])
-    pixels = (y // RAYS) * camera.width + x // RAYS
-    return MeshPoints(pixels, neighbours, nn.functional.normalize(found[:, 3:], dim=-1))
+    pixels = (y // rays) * camera.width + x // rays
+    normals = nn.functional.normalize(found[:, 3:], dim=-1).cpu()
+    neighbours = Neighbours(neighbours.indices.cpu(), neighbours.weights.cpu())
+    return MeshPoints(pixels.cpu(), neighbours, normals)
 
 
 def fit_textured_mesh(
-    avatar: HandAvatar, frames: list[Frame], color: Float[Tensor, "3"], steps: int, seed: int
+    avatar: HandAvatar,
+    frames: list[Frame],
+    color: Float[Tensor, "3"],
+    steps: int,
+    seed: int,
+    rays: int = RAYS,
 ) -> Callable[[Frame], Float[Tensor, "height width 4"]]:
-    """Fits texture and light to the frames.
+    """Fits texture and light to the known pixels of the frames, without their gain.
 
     Args:
         avatar: its personal mesh and nothing else.
-        frames: of training.
+        frames: of training, each in the pose that the mesh shall have.
         color: mean of their hand pixels.
         steps: of Adam.
         seed: of texels and pixels.
+        rays: of a pixel in each direction, in the frames that it learns from.
 
     Returns:
-        Colour on black and coverage of another frame's pose and camera.
+        Colour on black and coverage of another frame's pose and camera, as the capture's average
+        picture is exposed.
     """
     torch.manual_seed(seed)
     generator = torch.Generator().manual_seed(seed)
-    texels = sample_surface(avatar.rig.template_vertices, avatar.rig.faces, NUM_TEXELS, generator)
+    vertices, faces = avatar.rig.template_vertices.cpu(), avatar.rig.faces.cpu()
+    found = sample_surface(vertices, faces, NUM_TEXELS, generator)
+    device = avatar.device
+    texels = SurfacePoints(found.faces.to(device), found.barycentric.to(device))
     mesh = TexturedMesh(NUM_TEXELS, color)
     indices, weights, normals, truth = [], [], [], []
     for frame in frames:
-        points = mesh_points(avatar, texels, frame)
-        image = frame.image.flatten(0, 1)[points.pixels].float() / 255
+        points = mesh_points(avatar, texels, frame, rays)
+        image = frame.image.flatten(0, 1)[points.pixels].float() / 255 / frame.gain
         # Pixels that the hand covers in part show background as well.
-        kept = frame.alpha.flatten()[points.pixels] > 0.99
+        kept = ((frame.alpha > 0.99) & frame.known).flatten()[points.pixels]
         indices.append(points.neighbours.indices[kept])
         weights.append(points.neighbours.weights[kept])
         normals.append(points.normals[kept])

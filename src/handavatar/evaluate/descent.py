@@ -1,4 +1,4 @@
-"""How each of the peers is fitted."""
+"""How what is only compared with is fitted."""
 
 import math
 from collections.abc import Callable
