@@ -8,7 +8,7 @@ from source_tree import imported_modules, modules
 # Left: a folder or top module. Right: what it may import besides itself.
 EVERYTHING_BELOW = (
     "geometry hand capture field render edit replay avatar plain retouch processes unfinished "
-    "alignment animate evaluate train peers export view demo doctor"
+    "alignment animate evaluate train peers export view demo doctor synthetic bench"
 )
 MAY_IMPORT = {
     name: set(allowed.split())
@@ -28,6 +28,10 @@ MAY_IMPORT = {
         "plain": "geometry field render avatar",
         "evaluate": "geometry hand capture edit avatar alignment plain",
         "train": "geometry hand capture field render avatar plain alignment evaluate processes",
+        # Made videos with truth: a subject of the made captures before a background.
+        "synthetic": "geometry hand capture render",
+        # Registration against truth; it runs what training begins with, on captures and films.
+        "bench": "geometry hand capture render evaluate train synthetic",
         # Prior art, for a table alone.
         "peers": "geometry hand capture field render avatar evaluate train",
         # A texture's chart is rasterised; words of an edit mean what they mean elsewhere.

@@ -3,7 +3,8 @@
 Camera axes (OpenCV, the camera's centre as origin), metres; light and colours are linear.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -13,9 +14,9 @@ from torch.nn.functional import grid_sample, normalize
 
 from handavatar.capture.skin import smooth_noise
 from handavatar.capture.synthetic import Subject
-from handavatar.geometry.cameras import Camera, project
+from handavatar.geometry.cameras import Camera
 from handavatar.geometry.colors import linear_from_srgb
-from handavatar.geometry.meshes import vertex_normals
+from handavatar.geometry.meshes import face_cross_products, vertex_normals
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import Rig
@@ -110,13 +111,13 @@ class Actor:
             self.num_hand_vertices + ring * count + torch.arange(count) for ring in range(_RINGS)
         ]
         faces = []
-        for near, far in zip(rings, rings[1:], strict=False):
+        for near, far in pairwise(rings):
             # The hand's faces run along the rim; the arm's run against them: one orientation.
             a, b, c, d = near, near.roll(-1), far, far.roll(-1)
             faces += [torch.stack([b, a, c], -1), torch.stack([b, c, d], -1)]
         arm = torch.cat(faces)
-        edge = {(int(i), int(j)) for f in self.subject.rig.faces for i, j in zip(f, f.roll(-1))}
-        is_same = (int(self._rim[1]), int(self._rim[0])) in edge
+        own = torch.stack([self.subject.rig.faces, self.subject.rig.faces.roll(-1, 1)], -1)
+        is_same = bool((own == self._rim[:2].flip(0)).all(-1).any())
         return arm.flip(-1) if is_same else arm
 
     def _painted_arm(self, random: np.random.Generator) -> Float[Tensor, "vertices 3"]:
@@ -194,8 +195,13 @@ class Actor:
         return brought @ lights.colors
 
     def fragments(self, actor: PosedActor, camera: Camera) -> Fragments:
-        """What every pixel sees."""
-        return rasterize(actor.vertices, self.faces, camera)
+        """What every pixel sees; faces that are turned away are hidden by others."""
+        corners = actor.vertices[self.faces]
+        is_front = (face_cross_products(actor.vertices, self.faces) * corners[:, 0]).sum(-1) < 0
+        front = is_front.nonzero()[:, 0]
+        seen = rasterize(actor.vertices, self.faces[front], camera)
+        face = torch.where(seen.mask, front[seen.face_index.clamp_min(0)], -1)
+        return replace(seen, face_index=face)
 
     def is_hand(self, fragments: Fragments) -> Bool[Tensor, "height width"]:
         """Pixels that see the hand, not the forearm."""
