@@ -264,21 +264,19 @@ def natural_motion(rig: Rig, options: FilmOptions) -> Motion:
         ndimage.gaussian_filter1d(fingers.numpy(), _NOT_YET_SMOOTH, axis=0, mode="nearest")
     )
 
-    def wave(degrees: float, period: float) -> Tensor:
+    def wave(reach: float, period: float) -> Tensor:
         """A slow movement with a faster one on it."""
         time = share * options.seconds
         first, second = random.uniform(0, 2 * math.pi, 2)
         slow = torch.sin(2 * math.pi * time / period + first)
-        return degrees * (
-            0.8 * slow + 0.2 * torch.sin(2 * math.pi * time / (0.37 * period) + second)
-        )
+        return reach * (0.8 * slow + 0.2 * torch.sin(2 * math.pi * time / (0.37 * period) + second))
 
     to_back = {
         "palm": torch.zeros(frames),
         "back": torch.full((frames,), 180.0),
         "turn": 180 * _eased((share - 0.38) / 0.24),
     }[options.view]
-    yaw, pitch, roll = wave(28, 3.9), wave(20, 3.1), wave(16, 4.7) + random.uniform(-14, 14)
+    yaw, pitch, roll = wave(28.0, 3.9), wave(20.0, 3.1), wave(16.0, 4.7) + random.uniform(-14, 14)
     axes = torch.eye(3)
     about = [
         matrix_from_axis_angle(angle.deg2rad()[:, None] * axis)
