@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from handavatar.bench.measures import (
@@ -340,7 +340,7 @@ class FoundClip:
     focal: float
     crops: list[Camera]
     is_kept: list[bool]
-    masks: list[Float[np.ndarray, "side side"]] | None = None
+    masks: list[Bool[np.ndarray, "side side"]] | None = None
 
 
 class FilmRoad:

@@ -53,20 +53,20 @@ def _plain(height: int, width: int, random: np.random.Generator) -> np.ndarray:
     grey = random.uniform(0.55, 0.8)
     tint = random.uniform(-0.06, 0.06, 3)
     picture = _flat((grey + tint[0], grey + tint[1], grey + tint[2]), height, width)
-    picture += 0.008 * _noise(height, width, (6, 6), random)[..., None]
-    return picture + 0.012 * _noise(height, width, (160, 160), random)[..., None]
+    picture += 0.008 * _noise(height, width, (6.0, 6.0), random)[..., None]
+    return picture + 0.012 * _noise(height, width, (160.0, 160.0), random)[..., None]
 
 
 def _cloth(height: int, width: int, random: np.random.Generator) -> np.ndarray:
     y, x = np.mgrid[0:height, 0:width].astype(float)
-    fold = 9 * _noise(height, width, (170, 120), random)
+    fold = 9 * _noise(height, width, (170.0, 120.0), random)
     u, v = x + fold, y + np.roll(fold, 40, 1)
     base = np.array(random.uniform((0.2, 0.3, 0.4), (0.35, 0.5, 0.6)))
     stripe = np.array(random.uniform((0.5, 0.5, 0.4), (0.8, 0.8, 0.7)))
     lines = ((np.sin(2 * np.pi * u / 61) > 0.75) | (np.sin(2 * np.pi * v / 61) > 0.75)) * 0.7
     soft = ndimage.gaussian_filter(lines, 1.2)[..., None]
     weave = 0.03 * np.sin(2 * np.pi * u / 3.1) * np.sin(2 * np.pi * v / 3.1)
-    crease = 0.05 * _noise(height, width, (90, 60), random)
+    crease = 0.05 * _noise(height, width, (90.0, 60.0), random)
     return base * (1 - soft) + stripe * soft + (weave + crease)[..., None]
 
 
@@ -78,21 +78,21 @@ def _room(height: int, width: int, random: np.random.Generator) -> np.ndarray:
         color = 0.35 * random.uniform(0.05, 0.95, 3) + 0.65 * random.uniform(0.1, 0.9)
         picture[max(top, 0) : top + tall, max(left, 0) : left + wide] = color
     blurred = ndimage.gaussian_filter(picture, (2.5, 2.5, 0))
-    return blurred + 0.02 * _noise(height, width, (20, 20), random)[..., None]
+    return blurred + 0.02 * _noise(height, width, (20.0, 20.0), random)[..., None]
 
 
 def _skin(height: int, width: int, random: np.random.Generator) -> np.ndarray:
     picture = _flat((0.80, 0.62, 0.51), height, width)
-    picture += 0.02 * _noise(height, width, (180, 180), random)[..., None]
-    return picture + 0.012 * _noise(height, width, (7, 7), random)[..., None]
+    picture += 0.02 * _noise(height, width, (180.0, 180.0), random)[..., None]
+    return picture + 0.012 * _noise(height, width, (7.0, 7.0), random)[..., None]
 
 
 def _wood(height: int, width: int, random: np.random.Generator) -> np.ndarray:
     y = np.mgrid[0:height, 0:width][0].astype(float)
     board = np.floor(y / 118).astype(int)
-    rings = y * 0.20 + 1.6 * _noise(height, width, (60, 420), random)
+    rings = y * 0.20 + 1.6 * _noise(height, width, (60.0, 420.0), random)
     grain = 0.5 + 0.5 * np.sin(rings + 2.3 * board)
-    fibre = _noise(height, width, (2.0, 70), random)
+    fibre = _noise(height, width, (2.0, 70.0), random)
     share = (0.55 * grain + 0.12 * fibre + 0.1 * np.array([0.3, -0.6, 0.8, -0.2, 0.5])[board % 5])[
         ..., None
     ]
