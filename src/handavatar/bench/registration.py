@@ -150,8 +150,8 @@ def registration_table(
         rows = {row: [s[row] for s in of_clips.values() if row in s] for row in options.rows}
         cases[case] = {row: summarised(scores) for row, scores in rows.items() if scores}
         if len(of_clips) > 1:
-            for clip, scores in of_clips.items():
-                cases[f"{case}/{clip}"] = {row: summarised([s]) for row, s in scores.items()}
+            for clip, of_rows in of_clips.items():
+                cases[f"{case}/{clip}"] = {row: summarised([s]) for row, s in of_rows.items()}
     return RegistrationTable(
         title="Registration: found hands against true ones",
         rows={
