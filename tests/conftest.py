@@ -22,6 +22,8 @@ from handavatar.hand.parts import Parts, divide_into_parts
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.rig import PosedHand, Rig
 from handavatar.render.rasterize import interpolate, rasterize
+from handavatar.synthetic.films import FilmOptions, make_film
+from handavatar.synthetic.truth import FilmTruth, read_film_truth
 from handavatar.train.loop import Method
 from handavatar.train.prior import load_prior
 
@@ -122,6 +124,23 @@ def write_tiny_capture(
 def tiny_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three training and two test frames with known poses; read only."""
     return write_tiny_capture(tmp_path_factory.mktemp("capture") / "tiny")
+
+
+@pytest.fixture(scope="session")
+def film_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A made film of nine small pictures with its truth; read only."""
+    folder = tmp_path_factory.mktemp("films")
+    options = FilmOptions(
+        "small", 5, 0.9, ("spread", "relaxed"), sleeved=True, width=128, height=96, seconds=0.6
+    )
+    make_film(replace(options, crf=10, personal=0.0), folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def small_film(film_folder: Path) -> FilmTruth:
+    """Its truth."""
+    return read_film_truth(film_folder / "small.mp4")
 
 
 def avatar_of_the_prior() -> HandAvatar:

@@ -8,7 +8,7 @@ from source_tree import imported_modules, modules
 # Left: a folder or top module. Right: what it may import besides itself.
 EVERYTHING_BELOW = (
     "geometry jobs hand fit capture field render edit replay avatar plain retouch processes "
-    "alignment animate evaluate train peers export view demo doctor"
+    "alignment animate evaluate train peers export view demo doctor synthetic bench"
 )
 MAY_IMPORT = {
     name: set(allowed.split())
@@ -37,6 +37,10 @@ MAY_IMPORT = {
         "train": (
             "geometry jobs hand fit capture field render avatar plain alignment evaluate processes"
         ),
+        # Made videos with truth: a subject of the made captures before a background.
+        "synthetic": "geometry jobs hand capture render",
+        # Registration against truth; it runs what training begins with, on captures and films.
+        "bench": "geometry jobs hand fit capture render evaluate train synthetic",
         # Prior art, for a table alone.
         "peers": "geometry jobs hand fit capture field render avatar evaluate train",
         # A texture's chart is rasterised; words of an edit mean what they mean elsewhere.

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import write_tiny_capture
 from PIL import Image, ImageFilter
 from scipy.ndimage import distance_transform_edt
 
@@ -78,3 +79,22 @@ def test_a_folder_in_use_stays_as_it_is(tiny_capture: Path, tmp_path: Path) -> N
     with pytest.raises(CaptureError, match="not empty"):
         degrade_capture(tmp_path, DegradeOptions(tiny_capture))
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+
+def test_noise_may_last(tmp_path: Path) -> None:
+    source = write_tiny_capture(tmp_path / "source", "a" * 50)
+    frames = read_capture(source)
+    times = np.array([record.time for record in frames.records])
+    lasting = DegradeOptions(source, pose_noise=4.0, pose_noise_correlation=0.1, seed=2)
+    noisy = degrade_capture(tmp_path / "noisy", lasting)
+    turns = []
+    for before, after in zip(frames.records, noisy.records, strict=True):
+        true, read = (matrix_from_axis_angle(r.pose.rotations.double()) for r in (before, after))
+        turns.append(axis_angle_from_matrix(true.mT @ read))
+    series = np.rad2deg(torch.stack(turns).numpy()).reshape(len(turns), -1)
+    # The root mean square over joints does not depend on how long the noise lasts.
+    assert math.sqrt((series**2).mean() * 3) == pytest.approx(4.0, rel=0.1)
+    step = float(np.diff(times).mean())
+    for lag in (1, 3):
+        alike = (series[lag:] * series[:-lag]).mean() / (series**2).mean()
+        assert alike == pytest.approx(math.exp(-lag * step / 0.1), abs=0.06)

@@ -35,6 +35,9 @@ class DegradeOptions:
         source: folder of the capture.
         pose_noise: degrees (root mean square) by which every joint of every frame is turned about
             a random axis; the hand moves by half a millimetre per degree as well, each way.
+        pose_noise_correlation: seconds after which that noise has forgotten itself to 1 / e, as
+            trackers err for a while in the same way (an Ornstein-Uhlenbeck process along the times
+            of the frames); 0 draws every frame anew. The root mean square is the same.
         mask_erosion: pixels that the masks lose all around.
         blur: standard deviation of a Gaussian over the pictures, pixels.
         jpeg: quality of a JPEG in between, 1 to 95; 100 leaves it out.
@@ -43,6 +46,7 @@ class DegradeOptions:
 
     source: Path
     pose_noise: float = 0.0
+    pose_noise_correlation: float = 0.0
     mask_erosion: int = 0
     blur: float = 0.0
     jpeg: int = 100
@@ -52,6 +56,7 @@ class DegradeOptions:
         """Refuses what would make a capture better, or nothing of it."""
         limits = {
             "pose_noise": (0, 45),
+            "pose_noise_correlation": (0, 3600),
             "mask_erosion": (0, 64),
             "blur": (0, 32),
             "jpeg": (1, 100),
@@ -91,8 +96,9 @@ def degrade_capture(folder: Path, options: DegradeOptions, overwrite: bool = Fal
     )
     with writer:
         frames = [source.frame(index) for index in range(len(source.records))]
+        noise = _PoseNoise(options, random)
         for frame in frames:
-            writer.add(_degraded(frame, options, random))
+            writer.add(_degraded(frame, options, noise))
         if (source.folder / "truth").is_dir():
             shutil.copytree(
                 source.folder / "truth", writer.file("truth/poses.json").parent, dirs_exist_ok=True
@@ -113,7 +119,7 @@ def degrade_capture(folder: Path, options: DegradeOptions, overwrite: bool = Fal
     return read_capture(folder)
 
 
-def _degraded(frame: Frame, options: DegradeOptions, random: np.random.Generator) -> Frame:
+def _degraded(frame: Frame, options: DegradeOptions, noise: "_PoseNoise") -> Frame:
     picture = Image.fromarray(frame.image.numpy())
     if options.blur:
         picture = picture.filter(ImageFilter.GaussianBlur(options.blur))
@@ -131,7 +137,7 @@ def _degraded(frame: Frame, options: DegradeOptions, random: np.random.Generator
         image=torch.from_numpy(np.array(picture)),
         coverage=torch.from_numpy(coverage),
         camera=frame.camera,
-        pose=_misread(frame.pose, options.pose_noise, random),
+        pose=noise.misread(frame),
         confidence=min(frame.confidence, _TRACKED) if options.pose_noise else frame.confidence,
         split=frame.split,
         time=frame.time,
@@ -140,17 +146,42 @@ def _degraded(frame: Frame, options: DegradeOptions, random: np.random.Generator
     )
 
 
-def _misread(pose: HandPose, degrees: float, random: np.random.Generator) -> HandPose:
-    """Turns every joint by a random rotation vector of that root mean square length."""
-    if not degrees:
-        return pose
-    bones = len(pose.rotations)
-    turns = np.deg2rad(degrees) / np.sqrt(3) * random.standard_normal((bones, 3))
-    shift = _MILLIMETRES_PER_DEGREE * 1e-3 * degrees * random.standard_normal(3)
-    turned = matrix_from_axis_angle(pose.rotations.double()) @ matrix_from_axis_angle(
-        torch.from_numpy(turns)
-    )
-    return HandPose(
-        axis_angle_from_matrix(turned).to(pose.rotations),
-        pose.translation + torch.from_numpy(shift).to(pose.translation),
-    )
+class _PoseNoise:
+    """Errors of poses, frame after frame."""
+
+    def __init__(self, options: DegradeOptions, random: np.random.Generator) -> None:
+        self._degrees = options.pose_noise
+        self._correlation = options.pose_noise_correlation
+        self._random = random
+        self._last: np.ndarray | None = None
+        self._time = 0.0
+
+    def misread(self, frame: Frame) -> HandPose:
+        """Turns every joint by a random rotation vector of that root mean square length."""
+        pose = frame.pose
+        if not self._degrees:
+            return pose
+        bones = len(pose.rotations)
+        drawn = self._drawn(bones, frame)
+        turns = np.deg2rad(self._degrees) / np.sqrt(3) * drawn[:bones]
+        shift = _MILLIMETRES_PER_DEGREE * 1e-3 * self._degrees * drawn[bones]
+        turned = matrix_from_axis_angle(pose.rotations.double()) @ matrix_from_axis_angle(
+            torch.from_numpy(turns)
+        )
+        return HandPose(
+            axis_angle_from_matrix(turned).to(pose.rotations),
+            pose.translation + torch.from_numpy(shift).to(pose.translation),
+        )
+
+    def _drawn(self, bones: int, frame: Frame) -> np.ndarray:
+        """Standard normal numbers: three for every bone, and three for the translation."""
+        fresh = np.concatenate(
+            [self._random.standard_normal((bones, 3)), self._random.standard_normal((1, 3))]
+        )
+        if not self._correlation:
+            return fresh
+        if self._last is not None:
+            kept = float(np.exp(-abs(frame.time - self._time) / self._correlation))
+            fresh = kept * self._last + np.sqrt(1 - kept**2) * fresh
+        self._last, self._time = fresh, frame.time
+        return fresh

@@ -104,7 +104,10 @@ class FittedFrame:
 
 
 def capture_video(
-    options: VideoOptions, rig: Rig | None = None, progress: Progress | None = None
+    options: VideoOptions,
+    rig: Rig | None = None,
+    progress: Progress | None = None,
+    track: Track | None = None,
 ) -> Capture:
     """Makes a capture of a video of one hand.
 
@@ -115,6 +118,7 @@ def capture_video(
         options: which video, where to, how.
         rig: the hand to lay onto the pictures; the one that the options name if None.
         progress: called now and then.
+        track: what the tracker found in the video already; it is tracked if None.
 
     Returns:
         The capture as written. Frames that were left out stand with their reason in its
@@ -135,9 +139,10 @@ def capture_video(
         "inputs": (options.file, *files_named(options.rig)),
     }
     CaptureWriter(options.out, **header)  # type: ignore[arg-type]  # refuses a folder in use now
-    frames = video_frames(options.file, options.fps, options.max_frames)
-    track = track_hand(
-        frames, options.side, lambda done, _: report(0.4 * done / (done + 60), "finding the hand")
+    track = track or track_hand(
+        video_frames(options.file, options.fps, options.max_frames),
+        options.side,
+        lambda done, _: report(0.4 * done / (done + 60), "finding the hand"),
     )
     masks = _found_masks(track, report)
     fit, results = _fitted(track, masks, rig, options, report)

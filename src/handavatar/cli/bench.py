@@ -62,11 +62,18 @@ def _peers() -> _Bench:
     return _Bench(PeersTableOptions, peers_table)
 
 
+def _registration() -> _Bench:
+    from handavatar.bench.registration import RegistrationTableOptions, registration_table
+
+    return _Bench(RegistrationTableOptions, registration_table)
+
+
 _TABLES: dict[str, Callable[[], _Bench]] = {
     "ablation": _ablation,
     "geometry": _geometry,
     "lift": _lift,
     "peers": _peers,
+    "registration": _registration,
     "skin": _skin,
     "speed": _speed,
     "training": _training,
@@ -75,7 +82,7 @@ _TABLES: dict[str, Callable[[], _Bench]] = {
 
 
 def bench(words: list[str]) -> int:
-    """Measure a table: ``bench --table ablation|geometry|lift|peers|skin|speed|training``."""
+    """Measure a table: ``bench --table ablation|geometry|...``, or one of the other names."""
     from handavatar.cli.arguments import JSON, Extra, parse_with, print_json
     from handavatar.jobs.files import write_atomically
     from handavatar.train.progress import Progress

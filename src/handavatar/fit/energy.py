@@ -46,7 +46,7 @@ class EnergyOptions:
     color_outlier: float = 3.5
     """Standard deviations beyond which a colour has other causes."""
     color_share: float = 0.3
-    """Independent colours per blurred pixel of the hand: what light does to them, it does to many."""
+    """Independent colours per blurred pixel of the hand: light errs alike over many."""
     landmark_outlier: float = 3.0
     """Standard deviations beyond which a landmark is misplaced."""
 

@@ -62,7 +62,7 @@ def habit_residuals(
     # Bending has no middle that hands come back to, but a range.
     per_angle = torch.cat([outside[:, 1:], usual[:, 1:]], dim=1).flatten(1)
     eye = torch.eye(NUM_BONES)[None, :, None, :, None]
-    full = slopes[:, :, :, None, :] * eye.to(slopes)
+    full = torch.stack(slopes, dim=2)[:, :, :, None, :] * eye.to(angles)
     moved_outside = full * (is_outside / _OUTSIDE)[..., None, None]
     moved_usual = full / sigma[..., None, None]
     moved = torch.cat([moved_outside[:, 1:], moved_usual[:, 1:]], dim=1)

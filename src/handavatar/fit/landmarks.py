@@ -1,4 +1,4 @@
-"""What a tracker's 21 landmarks are on a rig: joints and fingertips, each with an offset of its own.
+"""What a tracker's 21 landmarks are on a rig: joints and fingertips, each with its own offset.
 
 Trackers are taught by people who click on knuckles; a rig's joints lie inside. The difference is
 the same in every frame, in the axes of the bone, and is learned over the clip.

@@ -60,7 +60,7 @@ class FramePicture:
         return FramePicture(camera, color / gain, hand, known, distance, border, normals)
 
     def is_known(self, pixels: Float[Tensor, "points 2"]) -> Bool[Tensor, "points"]:
-        """Whether anything is known of the pixels that hold these points; not beyond the picture."""
+        """Whether anything is known of the pixels of these points; not beyond the picture."""
         height, width = self.known.shape
         column, row = pixels.floor().long().unbind(-1)
         is_inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
@@ -84,7 +84,7 @@ class BlurredPicture:
     def sample(
         self, pixels: Float[Tensor, "points 2"]
     ) -> tuple[Float[Tensor, "points 4"], Float[Tensor, "points 4 2"]]:
-        """Bilinear values and their slopes over one pixel; beyond the picture its border goes on."""
+        """Bilinear values and slopes over one pixel; beyond the picture its border goes on."""
         return sample_with_slope(self.channels, pixels)
 
 

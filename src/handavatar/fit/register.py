@@ -6,7 +6,7 @@ how far they had to move. Colours come last, when the start is not spoilt, from 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
@@ -58,7 +58,7 @@ class RegisterOptions:
     """Standard deviations by which the shape coefficients may be off."""
     seed: int = 0
     """Of the poses to begin anew from."""
-    energy: EnergyOptions = EnergyOptions()
+    energy: EnergyOptions = field(default_factory=EnergyOptions)
     """Expected errors of what is observed."""
 
 

@@ -1,0 +1,1 @@
+"""Made videos of a hand of which everything is known: what registration is measured against."""
