@@ -110,9 +110,10 @@ def fit_textured_mesh(
     indices, weights, normals, truth = [], [], [], []
     for frame in frames:
         points = mesh_points(avatar, texels, frame)
-        image = frame.image.flatten(0, 1)[points.pixels].float() / 255
+        image = frame.colors.flatten(0, 1)[points.pixels]
         # Pixels that the hand covers in part show background as well.
-        kept = frame.alpha.flatten()[points.pixels] > 0.99
+        kept = (frame.alpha > 0.99) & frame.known
+        kept = kept.flatten()[points.pixels]
         indices.append(points.neighbours.indices[kept])
         weights.append(points.neighbours.weights[kept])
         normals.append(points.normals[kept])

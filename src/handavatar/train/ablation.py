@@ -316,9 +316,7 @@ def fitted_geometry(capture: Capture, shape: Shape, method: Method, seed: int) -
         seen,
         views,
         [_turned(avatar, tests[number], replace(settings, num_samples=256)) for number in chosen],
-        mean_color(
-            [frame.image.float() / 255 for frame in frames], [frame.mask for frame in frames]
-        ),
+        mean_color([frame.colors for frame in frames], [frame.mask for frame in frames]),
         [_hidden(view.samples, avatar) for view in views],
     )
 
@@ -543,7 +541,7 @@ def _column(shading: Shading, views: list[View]) -> Float[Tensor, "height width 
 def _true_column(capture: Capture, frames: list[Frame]) -> Float[Tensor, "height width 3"]:
     parts = []
     for frame in frames:
-        color = frame.image.float() / 255 * frame.alpha[..., None]
+        color = frame.shown.float() / 255 * frame.alpha[..., None]
         shading = torch.zeros_like(color)
         if knows_split(capture):
             shading = _truth(capture, "shading", frame.name)[..., None].expand(-1, -1, 3)
@@ -572,7 +570,14 @@ class FrameScores:
         alpha: Float[Tensor, "height width"],
     ) -> JudgedFrame:
         """Judges a picture on black against a frame."""
-        pair = JudgedFrame(color.clamp(0, 1), alpha > 0.5, frame.image.float() / 255, frame.alpha)
+        # Of what is not known both are black and empty.
+        known = frame.known
+        pair = JudgedFrame(
+            (color * frame.gain).clamp(0, 1) * known[..., None],
+            (alpha > 0.5) & known,
+            frame.image.float() / 255 * known[..., None],
+            frame.alpha * known,
+        )
         rendered, truth = pair.on_black()
         self.by_name["psnr"].append(masked_psnr(pair))
         self.by_name["ssim"].append(masked_ssim(pair))
