@@ -13,6 +13,7 @@ from handavatar.capture.tracking import Glance, TrackedHand
 
 _STEPS = np.arange(256) / 255
 _LINEAR = np.where(_STEPS <= 0.04045, _STEPS / 12.92, ((_STEPS + 0.055) / 1.055) ** 2.4)
+_LINEAR = _LINEAR.astype(np.float32)
 # Around the landmarks, in units of the hand's extent: skin, sleeve and shadow.
 _ROOM = 0.35
 _FEWEST_VIEWS = 3

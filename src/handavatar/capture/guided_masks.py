@@ -1,16 +1,15 @@
 """The second pass of the masks: the fitted hand says where skin can be, and what is not known.
 
-Colours are learned again, on the skin inside the fitted mesh and on what lies well outside of it, so
-that a face or a sleeve behind the hand counts as what it is. Nothing far from the mesh is hand. What
-the picture leaves open - a border without contrast, an object in front of the hand - is unknown, and
-so is what the camera did not see.
+Colours are learned again, on the skin inside the fitted mesh and on what lies well outside of it,
+so that a face or a sleeve behind the hand counts as what it is. Nothing far from the mesh is hand.
+What the picture leaves open - a border without contrast, an object in front of the hand - is
+unknown, and so is what the camera did not see.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, UInt8
 from scipy import ndimage
 from torch import Tensor
@@ -55,6 +54,8 @@ _SHORTEST_UNSURE = 8
 # Of what covers the hand: squared metres, and metres inside the mesh.
 _SMALLEST_COVER, _COVER_DEPTH, _SURE_COVER_DEPTH = 1e-4, 0.004, 0.008
 _EXPLAINED_SHARE = 0.02
+# OKLab; about a tenth of the way from grey to a pure colour.
+_SAME_HUE = 0.03
 # Behind and beside the cut at the wrist, metres.
 _WRIST_BAND = 0.002
 # Of gradients, 8-bit steps per pixel; of the distance of two outlines, metres.
@@ -203,9 +204,18 @@ def learn_guided_colors(
     if not inside or not outside:
         raise CaptureError("the hand fills the picture", "record it with room on every side")
     others = np.concatenate(outside)
-    model = color_model(np.concatenate(inside), others, generator, is_skin_elsewhere=False)
+    model = color_model(
+        _of_one_hue(np.concatenate(inside)), others, generator, is_skin_elsewhere=False
+    )
     densities = model.background.log_density(oklab_from_srgb(others))
     return GuidedColors(model, float(np.quantile(densities, _EXPLAINED_SHARE)))
+
+
+def _of_one_hue(colors: UInt8[np.ndarray, "n 3"]) -> UInt8[np.ndarray, "m 3"]:
+    """Skin is bright or dark, but of one hue: what differs lies before the hand, or beside it."""
+    hues = oklab_from_srgb(colors)[:, 1:]
+    apart = np.linalg.norm(hues - np.median(hues, axis=0), axis=-1)
+    return colors[apart < max(_SAME_HUE, 4 * float(np.median(apart)))]
 
 
 def at_average_exposure(
@@ -270,9 +280,7 @@ def find_guided_mask(
     edges, agreement = _border_quality(image, pixels, mesh, before & seen & ~cover)
     quality = float(np.sqrt(edges * agreement))
     covered_share = float((cover & mesh.covered).sum() / max(1, int(mesh.covered.sum())))
-    return GuidedMask(
-        HandMask(pixels, level, quality), ~unknown, edges, agreement, covered_share
-    )
+    return GuidedMask(HandMask(pixels, level, quality), ~unknown, edges, agreement, covered_share)
 
 
 def _cover(

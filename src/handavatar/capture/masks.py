@@ -279,7 +279,11 @@ def find_mask(hand: TrackedHand, colors: ColorModel) -> HandMask:
     labels[regions.core & (ratio > 0)] = HAND
     cut = graph_cut(hand.window.image, labels)
     is_sure = labels == BACKGROUND
-    level = settled_border(hand.window.image, cleaned_mask(cut, regions.core, regions.pixels_per_metre) & ~is_sure, is_sure)
+    level = settled_border(
+        hand.window.image,
+        cleaned_mask(cut, regions.core, regions.pixels_per_metre) & ~is_sure,
+        is_sure,
+    )
     cleaned = cleaned_mask(level > 0.5, regions.core, regions.pixels_per_metre)
     level = np.where(cleaned == (level > 0.5), level, cleaned)
     reference = cleaned_mask(by_color, regions.core, regions.pixels_per_metre)

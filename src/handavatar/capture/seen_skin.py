@@ -92,7 +92,7 @@ def skin_regions(rig: Rig) -> dict[str, Int[Tensor, "_"]]:
     # Of a right hand.
     back = torch.linalg.cross(fingers, thumb)
     labels = rig.skin_weights.argmax(-1)
-    regions: dict[str, Int[Tensor, "_"]] = {}
+    regions = {}
     parts = {"": (0,), **FINGER_BONES}
     for part, bones in parts.items():
         mine = torch.isin(labels, torch.tensor(bones))
