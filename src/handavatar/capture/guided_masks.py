@@ -342,7 +342,7 @@ def _beyond_limit(
     scale: float,
 ) -> Bool[np.ndarray, "side side"]:
     """Skin that goes on where the mesh is too far: a finger fitted badly, or somebody's face."""
-    beyond = (away > _LIMIT * scale) & (away < _DOUBTED * scale) & before & (ratio > SURE)
+    beyond = (away > _LIMIT * scale) & (away < _DOUBTED * scale) & before & (ratio > 1)
     pieces, _ = ndimage.label(beyond)
     touching = np.unique(pieces[grown(pixels & before, 2.0) & beyond])
     beyond &= np.isin(pieces, touching[touching > 0])

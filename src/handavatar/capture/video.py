@@ -746,7 +746,7 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     low, high = min(gain["smallest"]), max(gain["largest"])
     lines.append(f"exposure and white balance: {low:.2f} to {high:.2f} of the average")
     skin = summary["skin_never_seen"]
-    names = ", ".join(skin["regions"])
+    names = "; ".join(skin["regions"])
     lines.append(
         f"skin never seen: {100 * skin['share']:.0f} %" + (f" (most of: {names})" if names else "")
     )
