@@ -1,5 +1,7 @@
 """Made pictures of a hand whose mask is known."""
 
+from functools import cache
+
 import numpy as np
 import torch
 
@@ -33,8 +35,9 @@ def made_fit(number: int) -> HandFit:
     )
 
 
+@cache
 def made_hand(number: int) -> tuple[TrackedHand, np.ndarray]:
-    """A shaded skin-coloured hand before a striped wall, and its true mask."""
+    """A shaded skin-coloured hand before a striped wall, and its true mask; read only."""
     rig, fit = load_open_hand("778"), made_fit(number)
     generator = np.random.default_rng(number)
     model = HandModel(rig)

@@ -594,7 +594,7 @@ class CaptureWriter:
                 )
         Image.fromarray(frame.image.cpu().numpy()).save(self.file(image_path))
         Image.fromarray(frame.coverage.cpu().numpy()).save(self.file(mask_path))
-        said = {}
+        said: dict[str, Any] = {}
         if not bool(frame.known.all()):
             said["known_path"] = f"known/{frame.name}.png"
             known = frame.known.byte().cpu().numpy() * np.uint8(255)
