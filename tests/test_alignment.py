@@ -73,4 +73,4 @@ def test_a_mask_far_away_or_empty_changes_little(small_avatar: HandAvatar) -> No
 def test_it_is_given_no_colours() -> None:
     """What is not handed over cannot be used: mask and camera, but neither frame nor image."""
     names = list(inspect.signature(aligned_pose).parameters)
-    assert names == ["hand_of", "pose", "camera", "coverage", "steps", "start"]
+    assert names == ["hand_of", "pose", "camera", "coverage", "steps", "start", "known"]

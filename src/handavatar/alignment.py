@@ -20,7 +20,7 @@ from handavatar.hand.pose import (
 )
 from handavatar.hand.rig import ShapedHand
 from handavatar.render.rasterize import covered_pixels
-from handavatar.render.silhouette import OutlinePoints, outline_points, signed_distance
+from handavatar.render.silhouette import OutlinePoints, known_distance, outline_points
 
 # Of the picture's width: how far apart outline and border are in a good fit, and how far apart
 # they may be before something else than the pose is at fault.
@@ -41,6 +41,7 @@ def aligned_pose(
     coverage: Float[Tensor, "height width"],
     steps: int = 16,
     start: HandPose | None = None,
+    known: Bool[Tensor, "height width"] | None = None,
 ) -> HandPose:
     """A pose, moved a little so that the outline of the hand lies on the border of the mask.
 
@@ -54,25 +55,34 @@ def aligned_pose(
         coverage: of each pixel by the hand in the picture, in [0, 1].
         steps: of Gauss-Newton.
         start: where to begin, if not at ``pose``.
+        known: of the picture's pixels, those that show hand or background; None for all. Outline
+            that lies elsewhere, or whose nearest border does, draws at nothing.
     """
     found = start or pose
-    mask = coverage >= 0.5
+    known = torch.ones_like(coverage, dtype=torch.bool) if known is None else known
+    mask = (coverage >= 0.5) & known
     if not bool(mask.any()) or steps == 0:
         return found
-    distance = _smoothed(signed_distance(coverage).to(pose.rotations.device))
-    before = _overlap(hand_of(found), found, camera, mask)
+    device = pose.rotations.device
+    distance, was_seen = known_distance(coverage, known)
+    distance, was_seen, known = (
+        _smoothed(distance.to(device)),
+        was_seen.to(device),
+        known.to(device),
+    )
+    before = _overlap(hand_of(found), found, camera, mask, known)
     first = found
     for _ in range(steps):
         hand = hand_of(found)
         points = outline_points(hand.posed(found).vertices, hand.rig.faces, camera)
         if len(points.ends) == 0:
             return first
-        found = _stepped(hand, points, pose, found, camera, distance)
+        found = _stepped(hand, points, pose, found, camera, distance, was_seen)
         if not bool(
             torch.isfinite(found.rotations).all() & torch.isfinite(found.translation).all()
         ):
             return first
-    return found if _overlap(hand_of(found), found, camera, mask) >= before else first
+    return found if _overlap(hand_of(found), found, camera, mask, known) >= before else first
 
 
 def _stepped(
@@ -82,6 +92,7 @@ def _stepped(
     current: HandPose,
     camera: Camera,
     distance: Float[Tensor, "height width"],
+    was_seen: Bool[Tensor, "height width"],
 ) -> HandPose:
     """One Gauss-Newton step from ``current``."""
     # What the pose adds to the rest vertices hardly changes within a step.
@@ -104,6 +115,9 @@ def _stepped(
     scale = camera.width * torch.tensor([_EXPECTED, _OUTLIER], device=values.device)
     trust = points.lengths / points.lengths.sum() * _INDEPENDENT_POINTS
     trust = trust / ((1 + (residuals / scale[1]).square()).square() * scale[0] ** 2)
+    size = torch.tensor(was_seen.shape, device=values.device).flip(0)
+    x, y = pixels.detach().floor().long().clamp_min(0).minimum(size - 1).unbind(-1)
+    trust = trust * was_seen[y, x]
     moved = values - torch.cat([tracked.rotations.flatten(), tracked.translation])
     prior = _prior(len(values), camera)
     normal = torch.einsum("pu,p,pv->uv", jacobian, trust, jacobian) + prior
@@ -145,9 +159,13 @@ def _sampled(
 
 
 def _overlap(
-    hand: ShapedHand, pose: HandPose, camera: Camera, mask: Bool[Tensor, "height width"]
+    hand: ShapedHand,
+    pose: HandPose,
+    camera: Camera,
+    mask: Bool[Tensor, "height width"],
+    known: Bool[Tensor, "height width"],
 ) -> float:
-    """Intersection over union of the posed hand and the mask."""
-    covered = covered_pixels(hand.posed(pose).vertices, hand.rig.faces, camera)
+    """Intersection over union of the posed hand and the mask, of the known pixels."""
+    covered = covered_pixels(hand.posed(pose).vertices, hand.rig.faces, camera) & known
     mask = mask.to(covered.device)
     return int((covered & mask).sum()) / max(int((covered | mask).sum()), 1)

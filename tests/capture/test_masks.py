@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-import torch
+from made_hands import made_hand
 from scipy import ndimage
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from handavatar.capture.fitted_hand import HandFit, HandModel, projected
 from handavatar.capture.masks import (
     GaussianMixture,
     find_mask,
@@ -17,16 +16,6 @@ from handavatar.capture.masks import (
     pixels_per_metre,
     settled_border,
 )
-from handavatar.capture.outlines import silhouette
-from handavatar.capture.tracking import TrackedHand
-from handavatar.capture.windows import Window, window_camera
-from handavatar.geometry.rotations import axis_angle_from_matrix
-from handavatar.hand.open_hand import load_open_hand
-from handavatar.hand.pose_sampling import gesture_rotations
-
-SIDE = 320
-PICTURE = (400, 400)
-CORNER = (40.0, 40.0)
 
 
 def test_oklab_of_known_colours() -> None:
@@ -98,45 +87,9 @@ def test_where_skin_and_wall_look_alike_the_border_stays() -> None:
     assert int((settled ^ true).sum()) < 12
 
 
-def _made_hand(number: int) -> tuple[TrackedHand, np.ndarray]:
-    """A shaded skin-coloured hand before a striped wall, and its true mask."""
-    rig = load_open_hand("778")
-    generator = np.random.default_rng(number)
-    rotations = gesture_rotations(rig, "spread")[None].clone()
-    upright = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
-    rotations[0, 0] = axis_angle_from_matrix(upright)
-    shape = torch.zeros(rig.shape_directions.shape[-1])
-    fit = HandFit(
-        rotations,
-        torch.tensor([[0.005 * number - 0.02, 0.10, 0.5]]),
-        shape,
-        torch.tensor(400.0).log(),
-        torch.zeros(21, 3),
-    )
-    model = HandModel(rig)
-    camera = window_camera(400.0, PICTURE, CORNER, float(SIDE), SIDE)
-    mask = silhouette(rig, model.all_vertices(fit)[0], camera)
-    y, x = np.mgrid[:SIDE, :SIDE]
-    wall = np.stack([110 + 25 * (x // 40 % 2), 120 + 0 * x, 130 + 20 * (y // 60 % 2)], axis=-1)
-    shade = 0.7 + 0.3 * x / SIDE
-    skin = np.array([205.0, 150.0, 120.0]) * shade[..., None]
-    image = np.where(mask[..., None], skin, wall) + generator.normal(0, 5, (SIDE, SIDE, 3))
-    points = model.landmarks(fit)
-    hand = TrackedHand(
-        index=number,
-        time=number / 10,
-        window=Window(image.clip(0, 255).astype(np.uint8), CORNER, 1.0, PICTURE),
-        landmarks=projected(points, fit.log_focal.exp(), PICTURE)[0].double().numpy(),
-        spread=np.ones(21),
-        world_landmarks=(points - points.mean(1, keepdim=True))[0].double().numpy(),
-        presence=0.95,
-    )
-    return hand, mask
-
-
 def test_a_made_hand_is_cut_out_again() -> None:
     pytest.importorskip("cv2")
-    made = [_made_hand(number) for number in range(4)]
+    made = [made_hand(number) for number in range(4)]
     colors = learn_colors([hand for hand, _ in made])
     hand, truth = made[2]
     found = find_mask(hand, colors)
@@ -146,6 +99,6 @@ def test_a_made_hand_is_cut_out_again() -> None:
 
 
 def test_scale_is_focal_length_over_depth() -> None:
-    hand, _ = _made_hand(0)
+    hand, _ = made_hand(0)
     # 400 pixels at about half a metre; the hand's own depth range is a few per cent of that.
     assert pixels_per_metre(hand) == pytest.approx(800, rel=0.05)

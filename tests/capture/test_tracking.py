@@ -1,6 +1,7 @@
 """Following one hand: what is kept, skipped, mirrored and refused."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from handavatar.capture.tracking import (
     LANDMARK_NAMES,
     HandFinder,
     Sighting,
+    UnusableTrackError,
     track_hand,
 )
 from handavatar.capture.windows import resampled, window_around
@@ -69,19 +71,28 @@ def test_a_few_frames_without_or_with_two_hands_are_skipped_by_name(
     assert track.skipped == {3: "no hand found", 5: "two hands"}
     assert track.side == "right" and len(track.hands) == 18
     assert track.picture_size == (WIDTH, HEIGHT)
+    assert [glance.index for glance in track.glances] == list(range(20))
+    assert track.votes_right == 1.0
 
 
 def test_two_hands_all_along_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     both = [_sighting(True), _sighting(False, 150)]
     _install(monkeypatch, {i: both for i in range(4)})
-    with pytest.raises(CaptureError, match="two hands in 4 of 20"):
+    with pytest.raises(UnusableTrackError, match="two hands in 4 of 20") as caught:
         track_hand(_frames(20))
+    assert len(caught.value.track.hands) == 16 and len(caught.value.track.skipped) == 4
 
 
 def test_no_hand_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    _install(monkeypatch, {i: [] for i in range(20)})
-    with pytest.raises(CaptureError, match="found in 0 of 20"):
+    _install(monkeypatch, {i: [] for i in range(256)})
+    bright = [replace(frame, image=frame.image + np.uint8(100)) for frame in _frames(20)]
+    with pytest.raises(CaptureError, match="found in 0 of 20") as caught:
+        track_hand(bright)
+    assert "dark" not in str(caught.value)
+    # The same with grey levels of 0 to 19: what is to blame has a name.
+    with pytest.raises(CaptureError, match=r"found in 0 of 20.*too dark") as caught:
         track_hand(_frames(20))
+    assert "light" in caught.value.remedy
 
 
 def test_a_left_hand_is_mirrored_to_a_right_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,22 +1,37 @@
 """A video becomes a capture."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from made_hands import CORNER, FOCAL, PICTURE, SIDE, made_fit, made_hand
 from PIL import Image
+from safetensors.torch import load_file
 from scipy import ndimage
 from videos import REAL_VIDEO, grey_levels, needs_real_video, save_video
 
+from handavatar.capture import video as video_module
 from handavatar.capture.checks import CaptureError
+from handavatar.capture.fitted_hand import HandModel
 from handavatar.capture.fitting import FitOptions
 from handavatar.capture.frames import find_problems
-from handavatar.capture.video import VideoOptions, capture_video, held_out_splits
+from handavatar.capture.tracking import Glance, Track
+from handavatar.capture.video import (
+    FittedHands,
+    VideoOptions,
+    capture_video,
+    held_out_splits,
+    splits_by_index,
+    summary_lines,
+)
+from handavatar.capture.windows import Window
 from handavatar.geometry.cameras import project
 from handavatar.hand.open_hand import load_open_hand
+from handavatar.hand.rig import Rig
 
 
 @pytest.mark.parametrize("count", [8, 30, 207, 600])
@@ -28,12 +43,120 @@ def test_two_blocks_of_time_are_held_out(count: int) -> None:
     assert changes == 4 and splits[0] == splits[-1] == "train"
 
 
-def test_a_video_without_a_hand_leaves_nothing_behind(tmp_path: Path) -> None:
+def _track(num_hands: int, num_skipped: int, reason: str = "no hand found") -> Track:
+    """A video in which every other picture shows no hand, as long as there are such."""
+    hands, skipped, glances = [], {}, []
+    for number in range(num_hands + num_skipped):
+        image = np.full((9, 16, 3), 100, dtype=np.uint8)
+        glances.append(Glance(number, number / 10, image))
+        if len(skipped) < num_skipped and number % 2 == 0:
+            skipped[number] = reason
+        else:
+            hands.append(replace(made_hand(0)[0], index=number, time=number / 10))
+    return Track("right", tuple(hands), skipped, PICTURE, tuple(glances))
+
+
+def test_what_is_held_out_does_not_depend_on_what_was_found() -> None:
+    found, hardly = (splits_by_index(_track(*counts)) for counts in ((40, 0), (22, 18)))
+    assert found == hardly and list(found) == list(range(40))
+    assert list(found.values()) == held_out_splits(40)
+
+
+def test_a_video_without_a_hand_says_so_and_shows_its_pictures(tmp_path: Path) -> None:
     pytest.importorskip("mediapipe")
     video = save_video(tmp_path / "wall.mp4", grey_levels(12))
-    with pytest.raises(CaptureError, match="a hand was found in 0 of 4"):
-        capture_video(VideoOptions(video, tmp_path / "out"))
-    assert [path.name for path in tmp_path.iterdir()] == ["wall.mp4"]
+    for folder in ("out.failed", "out.failed-2"):
+        with pytest.raises(CaptureError, match="a hand was found in 0 of 4") as caught:
+            capture_video(VideoOptions(video, tmp_path / "out"))
+        assert f"{folder}/overview.png" in caught.value.remedy
+        assert Image.open(tmp_path / folder / "overview.png").size[0] > 1000
+        reasons = json.loads((tmp_path / folder / "reasons.json").read_text())
+        assert reasons["reasons"] == {"no hand found": 4} and len(reasons["frames"]) == 4
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"wall.mp4", "out.failed", "out.failed-2"}
+
+
+def test_a_hand_wholly_in_the_picture_is_kept_and_known(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("cv2")
+    options, rig = _made_video(tmp_path, monkeypatch, PICTURE[0])
+    capture = capture_video(options, rig)
+    summary = json.loads((capture.folder / "fit.json").read_text())["summary"]
+    assert summary["kept"] == summary["pictures"] == _MADE
+    assert sum(split["pictures"] for split in summary["splits"].values()) == _MADE
+    assert summary["border"]["frames"] == 0
+    lines = summary_lines(summary)
+    assert "--side left overrules it" in lines[0]
+    assert lines[1] == f"frames: {_MADE} of {_MADE} kept"
+    frame = capture.frame(0)
+    # All but the cut across the wrist.
+    assert 0.97 < float(frame.known.float().mean()) < 1
+    assert 0.1 < float(frame.mask.float().mean()) < 0.6
+    counts = load_file(capture.folder / "seen.safetensors")["counts"]
+    assert len(counts) == rig.num_vertices and int(counts.max()) == _MADE
+
+
+def test_a_hand_that_leaves_the_picture_is_rejected_by_that_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The picture ends in the middle of the hand; what the window shows beyond repeats it."""
+    pytest.importorskip("cv2")
+    options, rig = _made_video(tmp_path, monkeypatch, 205)
+    seen = []
+    result_of = video_module._result
+    monkeypatch.setattr(video_module, "_result", lambda *a: seen.append(result_of(*a)) or seen[-1])
+    with pytest.raises(CaptureError, match="the hand leaves the picture") as caught:
+        capture_video(options, rig)
+    assert "step back" in caught.value.remedy
+    reasons = json.loads((tmp_path / "out.failed" / "reasons.json").read_text())
+    assert reasons["reasons"] == {"border": _MADE}
+    assert all(
+        text.endswith(" % of the hand is in the picture") for text in reasons["frames"].values()
+    )
+    for result in seen:
+        frame = result.frame
+        right = (torch.arange(256) + 1 - frame.camera.center[0]) / frame.camera.focal[0] * FOCAL
+        beyond = right + 205 / 2 > 205 + 0.01
+        assert bool(beyond.any()) and not bool(frame.known[:, beyond].any())
+        assert not bool(frame.coverage[~frame.known].any())
+        assert bool((frame.image[:, beyond] == 128).all())
+
+
+_MADE = 9
+
+
+def _made_video(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, width: int
+) -> tuple[VideoOptions, Rig]:
+    """A video of made hands whose pictures end at a column; tracker and fit know the truth."""
+    rig, hands, vertices = load_open_hand("778"), [], []
+    size = (width, PICTURE[1])
+    for number in range(_MADE):
+        hand, _ = made_hand(number % 3)
+        image = hand.window.image.copy()
+        if width < SIDE + CORNER[0]:
+            inside = int(width - CORNER[0])
+            image[:, inside:] = image[:, inside - 1 : inside]
+        window = Window(image, CORNER, 1.0, size)
+        hands.append(replace(hand, index=number, time=number / 10, window=window))
+        # The principal point is the middle of the narrower picture.
+        posed = HandModel(rig).all_vertices(made_fit(number % 3))[0]
+        aside = (PICTURE[0] - width) / 2 / FOCAL * posed[:, 2:]
+        vertices.append(posed + aside * torch.tensor([1.0, 0, 0]))
+    fit = made_fit(0)
+    several = replace(
+        fit,
+        rotations=fit.rotations.expand(_MADE, -1, -1),
+        translation=torch.cat([made_fit(number % 3).translation for number in range(_MADE)]),
+    )
+    track = Track("right", tuple(hands), {}, size)
+    fitted = FittedHands(several, torch.stack(vertices), torch.full((_MADE,), 0.002))
+    monkeypatch.setattr(video_module, "track_hand", lambda *_: track)
+    monkeypatch.setattr(video_module, "video_frames", lambda *_: iter(()))
+    monkeypatch.setattr(video_module, "_found_masks", lambda *_: [])
+    monkeypatch.setattr(video_module, "_fitted", lambda *_: fitted)
+    return VideoOptions(tmp_path / "made.mp4", tmp_path / "out"), rig
 
 
 def test_a_folder_in_use_is_refused_before_any_work(tmp_path: Path) -> None:
@@ -58,10 +181,14 @@ def test_the_real_hand_becomes_a_sound_capture(tmp_path: Path) -> None:
     assert find_problems(capture.folder) == []
     assert capture.side == "right" and len(capture.records) == 10
     assert told == sorted(told) and told[-1] == 1.0
-    assert json.loads((capture.folder / "skipped.json").read_text()) == {}
+    skipped = json.loads((capture.folder / "skipped.json").read_text())
+    assert skipped == {"frames": {}, "reasons": {}}
     fit = json.loads((capture.folder / "fit.json").read_text())
     assert fit["mean_mask_iou"] > 0.88
     assert fit["mean_landmark_error_pixels"] < 6
+    assert fit["summary"]["splits"]["test"] == {"pictures": 2, "kept": 2}
+    assert "back" in fit["summary"]["skin_never_seen"]["regions"]
+    assert len(load_file(capture.folder / "seen.safetensors")["counts"]) > 778
     assert Image.open(capture.folder / "overview.png").size[0] > 1000
 
     hand = load_open_hand().shaped(capture.shape_coefficients)

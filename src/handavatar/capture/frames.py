@@ -58,6 +58,7 @@ from handavatar.jobs.files import (
 SCHEMA = 1
 SPLITS = ("train", "val", "test")
 MAX_FRAMES = 100_000
+_UNKNOWN_GREY = 128
 COVARIANCES = "covariances.safetensors"
 """File of a capture: tensor ``covariance``, one matrix per frame, in the order of the frames."""
 _MAKE_AGAIN = "make the capture again, or delete this file: poses then count as less sure"
@@ -102,8 +103,9 @@ class Frame:
         known: false where nothing is known: outside the camera's picture, under a sleeve or an
             object, or where the mask is unsure. Such a pixel is neither hand nor background, and
             counts in no loss and no figure. All are known if it is left out.
-        gain: of red, green and blue: by how much exposure and white balance make this picture
-            brighter than the capture's average; ones if it is left out.
+        gain: of red, green and blue: the factor by which exposure and white balance make the
+            stored values of this picture larger than those of the capture's average; ones if it is
+            left out.
         covariance: of the pose's errors, rotations bone by bone (radians) and then translation
             (metres); None where the capture does not say.
     """
@@ -136,6 +138,19 @@ class Frame:
     def alpha(self) -> Float[Tensor, "height width"]:
         """The coverage in [0, 1]."""
         return self.coverage.float() / 255
+
+    @property
+    def colors(self) -> Float[Tensor, "height width 3"]:
+        """Stored values as the capture's average exposure and white balance would give them.
+
+        In [0, 1], but where the gain is below one.
+        """
+        return self.image.float() / 255 / self.gain
+
+    @property
+    def shown(self) -> UInt8[Tensor, "height width 3"]:
+        """The picture for people to look at: grey where nothing is known."""
+        return torch.where(self.known[..., None], self.image, self.image.new_tensor(_UNKNOWN_GREY))
 
 
 @dataclass(frozen=True, eq=False)
@@ -606,7 +621,7 @@ class CaptureWriter:
                 )
         Image.fromarray(frame.image.cpu().numpy()).save(self.file(image_path))
         Image.fromarray(frame.coverage.cpu().numpy()).save(self.file(mask_path))
-        said = {}
+        said: dict[str, Any] = {}
         if not bool(frame.known.all()):
             said["known_path"] = f"known/{frame.name}.png"
             known = frame.known.byte().cpu().numpy() * np.uint8(255)

@@ -34,7 +34,11 @@ _BACKGROUND_MARGIN = 0.042
 _FOREARM_HALF_ANGLE = 60.0
 _HOLE_RADIUS = 0.004
 _CUT_ROUNDS = 1
-_SURE = 4.0
+SURE = 4.0
+"""Logarithm of a ratio of likelihoods from which on colour alone decides."""
+
+BACKGROUND, HAND, LIKELY_BACKGROUND, LIKELY_HAND = 0, 1, 2, 3
+"""GrabCut's labels."""
 
 # The last correction of the border, in pixels of the window; noise in 8-bit steps.
 _BORDER_ROUNDS = 3
@@ -211,7 +215,7 @@ def learn_colors(hands: Sequence[TrackedHand], seed: int = 0, num_frames: int = 
         CaptureError: the landmarks leave no background to learn from.
     """
     generator = np.random.default_rng(seed)
-    chosen = _sure_and_spread(hands, num_frames)
+    chosen = sure_and_spread(hands, num_frames)
     inside: list[np.ndarray] = []
     outside: list[np.ndarray] = []
     for hand in chosen:
@@ -223,8 +227,25 @@ def learn_colors(hands: Sequence[TrackedHand], seed: int = 0, num_frames: int = 
                 colors.append(generator.choice(pixels, min(len(pixels), 1500), axis=0))
     if not inside or not outside:
         raise CaptureError("the hand fills the picture", "record it with room on every side")
-    hand_colors = oklab_from_srgb(np.concatenate(inside))
-    other_colors = oklab_from_srgb(np.concatenate(outside))
+    return color_model(np.concatenate(inside), np.concatenate(outside), generator, True)
+
+
+def color_model(
+    inside: UInt8[np.ndarray, "n 3"],
+    outside: UInt8[np.ndarray, "m 3"],
+    generator: np.random.Generator,
+    is_skin_elsewhere: bool,
+) -> ColorModel:
+    """Two mixtures from colours that are mostly skin and mostly something else.
+
+    Args:
+        inside: sRGB, on the hand.
+        outside: sRGB, away from it.
+        generator: of the mixtures' starting points.
+        is_skin_elsewhere: whether what looks like skin away from the hand may be the hand's own and
+            is to be left out.
+    """
+    hand_colors, other_colors = oklab_from_srgb(inside), oklab_from_srgb(outside)
     for _ in range(2):
         model = ColorModel(
             fit_mixture(hand_colors, 5, generator), fit_mixture(other_colors, 6, generator)
@@ -232,7 +253,8 @@ def learn_colors(hands: Sequence[TrackedHand], seed: int = 0, num_frames: int = 
         # Landmarks beside the finger put background among the seeds, an unseen second patch of
         # skin puts skin among the background: what contradicts the first model is left out.
         hand_colors = hand_colors[model.ratio_of(hand_colors) > -1]
-        other_colors = other_colors[model.ratio_of(other_colors) < 3]
+        if is_skin_elsewhere:
+            other_colors = other_colors[model.ratio_of(other_colors) < 3]
         if len(hand_colors) < 500 or len(other_colors) < 500:
             break
     return model
@@ -248,19 +270,23 @@ def find_mask(hand: TrackedHand, colors: ColorModel) -> HandMask:
     ratio = ndimage.gaussian_filter(colors.log_ratio(hand.window.image), 1.0)
     allowed = regions.near | regions.forearm
     by_color = (ratio > 0) & allowed
-    labels = np.full(ratio.shape, _BACKGROUND, dtype=np.uint8)
-    labels[allowed] = _LIKELY_BACKGROUND
-    labels[by_color] = _LIKELY_HAND
+    labels = np.full(ratio.shape, BACKGROUND, dtype=np.uint8)
+    labels[allowed] = LIKELY_BACKGROUND
+    labels[by_color] = LIKELY_HAND
     # Left to itself GrabCut fills the gaps between fingers; where colour is sure, it decides.
-    labels[ratio < -_SURE] = _BACKGROUND
-    labels[(ratio > _SURE) & allowed] = _HAND
-    labels[regions.core & (ratio > 0)] = _HAND
-    cut = _graph_cut(hand.window.image, labels)
-    is_sure = labels == _BACKGROUND
-    level = settled_border(hand.window.image, _cleaned(cut, regions) & ~is_sure, is_sure)
-    cleaned = _cleaned(level > 0.5, regions)
+    labels[ratio < -SURE] = BACKGROUND
+    labels[(ratio > SURE) & allowed] = HAND
+    labels[regions.core & (ratio > 0)] = HAND
+    cut = graph_cut(hand.window.image, labels)
+    is_sure = labels == BACKGROUND
+    level = settled_border(
+        hand.window.image,
+        cleaned_mask(cut, regions.core, regions.pixels_per_metre) & ~is_sure,
+        is_sure,
+    )
+    cleaned = cleaned_mask(level > 0.5, regions.core, regions.pixels_per_metre)
     level = np.where(cleaned == (level > 0.5), level, cleaned)
-    reference = _cleaned(by_color, regions)
+    reference = cleaned_mask(by_color, regions.core, regions.pixels_per_metre)
     union = (cleaned | reference) & regions.near
     agreement = (cleaned & reference & regions.near).sum() / max(1, int(union.sum()))
     return HandMask(cleaned, level, float(agreement))
@@ -298,25 +324,39 @@ def settled_border(
     Returns:
         More than 0.5 on skin; falls smoothly across the border, in [0, 1].
     """
+    return settled(image, mask, is_background)[0]
+
+
+def settled(
+    image: UInt8[np.ndarray, "side side 3"],
+    mask: Bool[np.ndarray, "side side"],
+    is_background: Bool[np.ndarray, "side side"],
+) -> tuple[Float[np.ndarray, "side side"], Float[np.ndarray, "side side"]]:
+    """:func:`settled_border`, and how far the picture decides it.
+
+    The second result is, at every pixel near the border, the contrast between the skin and the
+    background of its neighbourhood, squared, as a share of itself and the noise: in [0, 1].
+    """
     pixels = image.astype(np.float32) @ _LUMA_AND_COLOR.T
     level = mask.astype(np.float32)
     for _ in range(_BORDER_ROUNDS):
-        depth = _depth(mask)
-        height = _depth(~mask)
+        depth = depth_inside(mask)
+        height = depth_inside(~mask)
         skin = _local_mean(pixels, depth > _BORDER_GAP)
         beside = _local_mean(pixels, height > _BORDER_GAP)
         apart = skin - beside
         contrast = (apart**2).sum(-1)
+        clearness = contrast / (contrast + _BORDER_NOISE**2)
         share = (((pixels - beside) * apart).sum(-1) / (contrast + 1e-6)).clip(0, 1)
         is_free = (depth <= _BORDER_REACH) & (height <= _BORDER_REACH) & ~is_background
-        trust = np.where(is_free, contrast / (contrast + _BORDER_NOISE**2), 1.0)
+        trust = np.where(is_free, clearness, 1.0)
         value = trust * np.where(is_free, share, mask) + _BORDER_INERTIA * mask
         weighed = np.stack([value, trust + _BORDER_INERTIA], axis=-1)
         smooth, weight = np.moveaxis(_blurred(weighed, _BORDER_SMOOTHING), -1, 0)
         smooth = smooth / weight
         level = np.where(is_free, smooth, mask).clip(0, 1)
         mask = level > 0.5
-    return level
+    return level, clearness
 
 
 def _local_mean(
@@ -337,7 +377,7 @@ def _blurred(
     return cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
 
 
-def _depth(mask: Bool[np.ndarray, "side side"]) -> Float[np.ndarray, "side side"]:
+def depth_inside(mask: Bool[np.ndarray, "side side"]) -> Float[np.ndarray, "side side"]:
     """Distance of each pixel of the mask from the nearest one that is not of it, pixels."""
     cv2 = _opencv()
     return cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
@@ -358,13 +398,14 @@ def _opencv() -> Any:
     return cv2
 
 
-# GrabCut's labels.
-_BACKGROUND, _HAND, _LIKELY_BACKGROUND, _LIKELY_HAND = 0, 1, 2, 3
-
-
-def _graph_cut(
+def graph_cut(
     image: UInt8[np.ndarray, "side side 3"], labels: UInt8[np.ndarray, "side side"]
 ) -> Bool[np.ndarray, "side side"]:
+    """GrabCut from labels; those that are not merely likely stay.
+
+    Raises:
+        CaptureError: OpenCV is not installed.
+    """
     cv2 = _opencv()
     if not (labels & 1).any() or (labels & 1).all():
         return (labels & 1).astype(bool)
@@ -377,33 +418,41 @@ def _graph_cut(
     return (labels & 1).astype(bool)
 
 
-def _cleaned(
-    mask: Bool[np.ndarray, "side side"], regions: _Regions
+def cleaned_mask(
+    mask: Bool[np.ndarray, "side side"],
+    core: Bool[np.ndarray, "side side"],
+    scale: float,
 ) -> Bool[np.ndarray, "side side"]:
-    """The piece with the palm, without specks and pinholes."""
-    radius = max(1.0, 0.001 * regions.pixels_per_metre)
-    mask = _within(~_within(~mask, radius), radius)
+    """The piece with the palm, without specks and pinholes.
+
+    Args:
+        mask: of the hand.
+        core: pixels of the hand beyond doubt.
+        scale: pixels per metre.
+    """
+    radius = max(1.0, 0.001 * scale)
+    mask = grown(~grown(~mask, radius), radius)
     pieces, count = ndimage.label(mask)
     if count == 0:
         return mask
-    overlap = np.bincount(pieces[regions.core], minlength=count + 1)[1:]
+    overlap = np.bincount(pieces[core], minlength=count + 1)[1:]
     mask = pieces == 1 + int(overlap.argmax())
     holes, count = ndimage.label(~mask)
     areas = np.bincount(holes.ravel(), minlength=count + 1)
-    limit = np.pi * (_HOLE_RADIUS * regions.pixels_per_metre) ** 2
+    limit = np.pi * (_HOLE_RADIUS * scale) ** 2
     is_small = areas < limit
     is_small[0] = False
     return mask | is_small[holes]
 
 
-def _within(mask: Bool[np.ndarray, "side side"], radius: float) -> Bool[np.ndarray, "side side"]:
+def grown(mask: Bool[np.ndarray, "side side"], radius: float) -> Bool[np.ndarray, "side side"]:
     """All pixels at most ``radius`` pixels from the mask."""
     if not mask.any():
         return mask
-    return _depth(~mask) <= radius
+    return depth_inside(~mask) <= radius
 
 
-def _sure_and_spread(hands: Sequence[TrackedHand], count: int) -> list[TrackedHand]:
+def sure_and_spread(hands: Sequence[TrackedHand], count: int) -> list[TrackedHand]:
     """From each of ``count`` stretches of time, the frame whose landmarks agree best."""
     stretches = np.array_split(np.arange(len(hands)), min(count, len(hands)))
     return [
@@ -417,22 +466,23 @@ def _regions(hand: TrackedHand) -> _Regions:
     side = hand.window.image.shape[0]
     bones = _drawn_bones(points, side, _CORE_RADIUS * scale)
     palm = _drawn_polygon(points[list(_PALM)], side)
-    inner_palm = ~_within(~palm, 0.008 * scale)
-    forearm = _forearm(points, side)
+    inner_palm = ~grown(~palm, 0.008 * scale)
+    forearm = forearm_cone(points, side)
     covered = bones | palm
-    distance = _depth(~covered)
+    distance = depth_inside(~covered)
     return _Regions(
         core=bones | inner_palm,
         near=distance < _HAND_RADIUS * scale,
         forearm=forearm,
         far=(distance > _BACKGROUND_MARGIN * scale)
-        & ~_within(forearm, 0.01 * scale)
-        & _inside_picture(hand.window),
+        & ~grown(forearm, 0.01 * scale)
+        & inside_picture(hand.window),
         pixels_per_metre=scale,
     )
 
 
-def _inside_picture(window: Window) -> Bool[np.ndarray, "side side"]:
+def inside_picture(window: Window) -> Bool[np.ndarray, "side side"]:
+    """Pixels of a window that the camera saw."""
     side = window.image.shape[0]
     centers = (np.arange(side) + 0.5) / window.scale
     x, y = centers + window.corner[0], centers + window.corner[1]
@@ -461,7 +511,7 @@ def _drawn_polygon(
     return np.asarray(canvas)
 
 
-def _forearm(points: Float[np.ndarray, "21 2"], side: int) -> Bool[np.ndarray, "side side"]:
+def forearm_cone(points: Float[np.ndarray, "21 2"], side: int) -> Bool[np.ndarray, "side side"]:
     """Where the forearm may lie: a wide cone behind the wrist, away from the knuckles."""
     knuckles = points[[5, 9, 13, 17]].mean(0)
     away = points[0] - knuckles

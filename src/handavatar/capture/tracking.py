@@ -6,13 +6,14 @@ by 35 degrees either way. Their median is steadier than any one of them, and whe
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from PIL import Image
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import VideoFrame
@@ -33,6 +34,10 @@ _VIEW_SIDE = 448
 _VIEW_SCALE = 2.0
 _MAX_SHARE_OF_TWO_HANDS = 0.1
 _MIN_FRAMES = 8
+_GLANCE_SIDE = 160
+# Of the picture's brightness, 0 to 255: below, a camera sees noise rather than skin.
+_DARK = 30.0
+TWO_HANDS, NO_HAND = "two hands", "no hand found"
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +92,25 @@ class TrackedHand:
 
 
 @dataclass(frozen=True, eq=False)
+class Glance:
+    """A whole picture of the video, made small.
+
+    Attributes:
+        index: number of the frame in the file.
+        time: seconds from the start.
+        image: sRGB; its longer side has at most 160 pixels.
+    """
+
+    index: int
+    time: float
+    image: UInt8[np.ndarray, "height width 3"]
+
+    def mirrored(self) -> "Glance":
+        """The mirrored picture."""
+        return replace(self, image=np.ascontiguousarray(self.image[:, ::-1]))
+
+
+@dataclass(frozen=True, eq=False)
 class Track:
     """One hand through a video.
 
@@ -95,12 +119,29 @@ class Track:
         hands: the frames in which it was found.
         skipped: frame index to the reason, for the others.
         picture_size: width and height of the pictures.
+        glances: all pictures that were looked at, with a hand or without, mirrored as the hands.
+        votes_right: the share of the tracker's votes that took it for a right hand, in [0, 1].
     """
 
     side: str
     hands: tuple[TrackedHand, ...]
     skipped: dict[int, str]
     picture_size: tuple[int, int]
+    glances: tuple[Glance, ...] = ()
+    votes_right: float = 1.0
+
+
+class UnusableTrackError(CaptureError):
+    """No hand to go on with.
+
+    Attributes:
+        track: what was found all the same.
+    """
+
+    def __init__(self, what: str, remedy: str, track: Track) -> None:
+        """Keeps the track, so that it can be shown."""
+        super().__init__(what, remedy)
+        self.track = track
 
 
 class HandFinder:
@@ -184,9 +225,11 @@ def track_hand(
         progress: called with the number of frames done and a word.
 
     Raises:
-        CaptureError: no hand, two hands in more than a tenth of the pictures, or mediapipe missing.
+        UnusableTrackError: no hand, or two hands in more than a tenth of the pictures.
+        CaptureError: mediapipe is missing.
     """
     hands: list[TrackedHand] = []
+    glances: list[Glance] = []
     is_right: list[float] = []
     skipped: dict[int, str] = {}
     last: Float[np.ndarray, "21 2"] | None = None
@@ -194,6 +237,7 @@ def track_hand(
     with HandFinder() as finder:
         for count, frame in enumerate(frames):
             picture_size = (frame.image.shape[1], frame.image.shape[0])
+            glances.append(_glance(frame))
             found = finder.track(frame.image)
             if not found and last is not None:
                 again = finder.look_closely(frame.image, last, 0.0)
@@ -204,15 +248,26 @@ def track_hand(
                 is_right.append(found[0].presence if found[0].is_right else -found[0].presence)
                 last = hand.landmarks
             else:
-                skipped[frame.index] = "two hands" if found else "no hand found"
+                skipped[frame.index] = TWO_HANDS if found else NO_HAND
             if progress is not None:
                 progress(count + 1, "tracking")
-    _check_found(hands, skipped)
     if side == "auto":
         side = "right" if sum(is_right) >= 0 else "left"
     if side == "left":
         hands = [hand.mirrored() for hand in hands]
-    return Track(side, tuple(hands), skipped, picture_size)
+        glances = [glance.mirrored() for glance in glances]
+    total = sum(abs(vote) for vote in is_right)
+    share = sum(vote for vote in is_right if vote > 0) / total if total else 0.5
+    track = Track(side, tuple(hands), skipped, picture_size, tuple(glances), share)
+    _check_found(track)
+    return track
+
+
+def _glance(frame: VideoFrame) -> Glance:
+    picture = Image.fromarray(frame.image)
+    # Means of whole blocks, so that the noise of single pixels is gone.
+    factor = max(1, -(-max(picture.size) // _GLANCE_SIDE))
+    return Glance(frame.index, frame.time, np.asarray(picture.reduce(factor)))
 
 
 def _combined(finder: HandFinder, frame: VideoFrame, first: Sighting) -> TrackedHand:
@@ -239,19 +294,29 @@ def _combined(finder: HandFinder, frame: VideoFrame, first: Sighting) -> Tracked
     )
 
 
-def _check_found(hands: Sequence[TrackedHand], skipped: dict[int, str]) -> None:
-    total = len(hands) + len(skipped)
-    num_double = sum(reason == "two hands" for reason in skipped.values())
+def _check_found(track: Track) -> None:
+    total = len(track.hands) + len(track.skipped)
+    num_double = sum(reason == TWO_HANDS for reason in track.skipped.values())
     if num_double > _MAX_SHARE_OF_TWO_HANDS * total:
-        raise CaptureError(
+        raise UnusableTrackError(
             f"two hands in {num_double} of {total} pictures; expected one",
             "record one hand alone, or crop the video to it",
+            track,
         )
-    if len(hands) < _MIN_FRAMES:
-        raise CaptureError(
-            f"a hand was found in {len(hands)} of {total} pictures; at least {_MIN_FRAMES} "
-            "are needed",
-            "record one bare hand, whole and well lit, larger than a sixth of the picture",
+    if len(track.hands) < _MIN_FRAMES:
+        found = (
+            f"a hand was found in {len(track.hands)} of {total} pictures; at least {_MIN_FRAMES} "
+            "are needed"
+        )
+        brightness = [float(glance.image.mean()) for glance in track.glances]
+        if brightness and float(np.median(brightness)) < _DARK:
+            raise UnusableTrackError(
+                f"{found}; the pictures are too dark (mean {np.median(brightness):.0f} of 255)",
+                "record in more light",
+                track,
+            )
+        raise UnusableTrackError(
+            found, "record one bare hand, whole, larger than a sixth of the picture", track
         )
 
 

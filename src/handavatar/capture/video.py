@@ -2,21 +2,22 @@
 
 import json
 import os
+from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt8
-from PIL import Image, ImageDraw
-from scipy import ndimage
+from jaxtyping import Bool, Float
+from safetensors.torch import save_file
 from torch import Tensor
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import video_frames
+from handavatar.capture.exposure import exposure_gains
 from handavatar.capture.fitted_hand import HandFit, HandModel
 from handavatar.capture.fitting import (
     FitOptions,
@@ -25,16 +26,35 @@ from handavatar.capture.fitting import (
     landmark_errors,
     single_threaded,
 )
-from handavatar.capture.frames import Capture, CaptureWriter, Frame, read_capture
-from handavatar.capture.masks import HandMask, find_mask, learn_colors, pixels_per_metre
-from handavatar.capture.outlines import (
-    OutlineMatcher,
-    is_behind_wrist,
-    mask_outline,
-    silhouette,
+from handavatar.capture.frames import SPLITS, Capture, CaptureWriter, Frame, read_capture
+from handavatar.capture.guided_masks import (
+    GuidedMask,
+    cut_at_wrist,
+    find_guided_mask,
+    is_cut_unsure,
+    learn_guided_colors,
+    placed_mesh,
+    wrist_line,
 )
-from handavatar.capture.tracking import Track, TrackedHand, track_hand
-from handavatar.capture.windows import resampled, window_camera
+from handavatar.capture.masks import (
+    HandMask,
+    find_mask,
+    inside_picture,
+    learn_colors,
+    pixels_per_metre,
+)
+from handavatar.capture.outlines import OutlineMatcher, mask_outline, silhouette
+from handavatar.capture.overview import Tile, contact_sheet, outlined
+from handavatar.capture.seen_skin import SeenSkin, count_seen_skin
+from handavatar.capture.tracking import (
+    NO_HAND,
+    TWO_HANDS,
+    Track,
+    TrackedHand,
+    UnusableTrackError,
+    track_hand,
+)
+from handavatar.capture.windows import Window, resampled, window_camera
 from handavatar.geometry.cameras import project
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
@@ -47,13 +67,19 @@ Progress = Callable[[float, str], None]
 
 _BOX_SCALE = 1.3
 _SUBPIXELS = 3
-_WRIST_BAND = 0.020
-_WRIST_SLACK = 0.004
 _HELD_OUT = ((0.28, 0.08), (0.68, 0.08))
 _MIN_KEPT = 8
-_SHEET_TILE = 192
-_SHEET_COLUMNS = 9
-_SHEET_FRAMES = 63
+_SEEN_SHARE = 0.9
+# Side of the little picture in which it is counted how much of the hand was seen.
+_COUNTED_SIDE = 96
+# Pixels of the video between the farthest landmarks of a hand.
+_SMALLEST_HAND = 48.0
+# Of a video's pictures, 0 to 255.
+_DARK = 30.0
+# Of the mesh: as much of it beyond the picture is contact with the border.
+_TOUCHES = 0.01
+# Of the tracker's votes for one side.
+_CLEAR_VOTE = 0.75
 
 
 @dataclass(frozen=True)
@@ -87,6 +113,63 @@ class VideoOptions:
 
 
 @dataclass(frozen=True, eq=False)
+class FittedHands:
+    """The hand laid onto all pictures in which it was found.
+
+    Attributes:
+        fit: shape, poses, focal length.
+        vertices: of the rig in every frame, metres, camera axes.
+        landmark_errors: mean distance of fitted and tracked landmarks, metres.
+    """
+
+    fit: HandFit
+    vertices: Float[Tensor, "frames vertices 3"]
+    landmark_errors: Float[Tensor, "frames"]
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Why a picture is not in the capture.
+
+    Attributes:
+        kind: a key of ``CAUSES``.
+        text: the same with figures.
+    """
+
+    kind: str
+    text: str
+
+
+CAUSES: dict[str, tuple[str, str]] = {
+    "border": (
+        "the hand leaves the picture",
+        "keep the whole hand and the wrist in the picture: step back, or move to its middle",
+    ),
+    "hidden": (
+        "something hides the hand",
+        "push the sleeve back, and let nothing come before the hand",
+    ),
+    "background": (
+        "what is behind the hand looks like skin (a face, clothes, wood)",
+        "hold the hand before something of another colour",
+    ),
+    "pose": (
+        "hand and tracked pose do not fit together",
+        "move slowly; turn fists and edge-on hands so that the fingers are seen",
+    ),
+    "side": (
+        "the hand may have been taken for the other one",
+        "if the side is wrong, name it with --side left or --side right",
+    ),
+    "small": ("the hand is too small", "come closer to the camera"),
+    "dark": ("the pictures are too dark", "record in more light"),
+    TWO_HANDS: ("there are two hands", "record one hand alone, or crop the video to it"),
+    NO_HAND: ("no hand is seen", "record one bare hand, whole, larger than a sixth of the picture"),
+}
+"""What goes wrong with a picture, and what to do about it."""
+
+
+@dataclass(frozen=True, eq=False)
 class FittedFrame:
     """What became of one picture in which the hand was found.
 
@@ -95,12 +178,20 @@ class FittedFrame:
         mesh: pixels that the fitted hand covers.
         mask_iou: agreement of mask and mesh in front of the wrist, intersection over union.
         landmark_error: mean distance of fitted and tracked landmarks, pixels of the crop.
+        mask_quality: how far the mask's border follows edges of the picture, in [0, 1].
+        outside_share: of the fitted mesh, beyond the camera's picture.
+        unknown_share: of the fitted mesh, in the picture but hidden or not told apart.
+        reason: why it is to be left out; None if it is good.
     """
 
     frame: Frame
     mesh: Bool[np.ndarray, "height width"]
     mask_iou: float
     landmark_error: float
+    mask_quality: float
+    outside_share: float
+    unknown_share: float
+    reason: LeftOut | None
 
 
 def capture_video(
@@ -122,10 +213,11 @@ def capture_video(
 
     Returns:
         The capture as written. Frames that were left out stand with their reason in its
-        ``skipped.json``, the agreement of every frame in ``fit.json``.
+        ``skipped.json``, the agreement of every frame and a summary in ``fit.json``.
 
     Raises:
-        CaptureError: the video cannot be used, the folder is in use, or an extra is missing.
+        CaptureError: the video cannot be used, the folder is in use, or an extra is missing. If the
+            pictures are the cause, a folder beside the would-be capture shows them.
     """
     report = progress or (lambda share, doing: None)
     rig = rig or load_rig(options.rig)
@@ -139,39 +231,63 @@ def capture_video(
         "inputs": (options.file, *files_named(options.rig)),
     }
     CaptureWriter(options.out, **header)  # type: ignore[arg-type]  # refuses a folder in use now
-    track = track or track_hand(
-        video_frames(options.file, options.fps, options.max_frames),
-        options.side,
-        lambda done, _: report(0.4 * done / (done + 60), "finding the hand"),
-    )
-    masks = _found_masks(track, report)
-    fit, results = _fitted(track, masks, rig, options, report)
-    report(0.95, "writing")
-    skipped = {f"{index:06d}": reason for index, reason in track.skipped.items()}
-    for result in results:
-        if result.frame.confidence < options.min_confidence:
-            skipped[result.frame.name] = f"unsure pose: confidence {result.frame.confidence:.2f}"
-    kept = [result for result in results if result.frame.name not in skipped]
-    if len(kept) < _MIN_KEPT:
-        raise CaptureError(
-            f"{options.file}: only {len(kept)} of {len(results) + len(track.skipped)} pictures "
-            f"could be fitted with confidence; at least {_MIN_KEPT} are needed",
-            "record slower movements, in better light, before a plain background",
+    try:
+        track = track or track_hand(
+            video_frames(options.file, options.fps, options.max_frames),
+            options.side,
+            lambda done, _: report(0.4 * done / (done + 60), "finding the hand"),
         )
-    splits = held_out_splits(len(kept))
+    except UnusableTrackError as error:
+        raise _failure(options, error.what, error.remedy, error.track, []) from error
+    # By time, over all pictures, before anybody knows which of them can be fitted.
+    splits = splits_by_index(track)
+    fitted, results = _laid_on(track, rig, options, report)
+    report(0.95, "writing")
+    left_out = _left_out(track, results)
+    kept = [result for result in results if result.frame.name not in left_out]
+    if len(kept) < _MIN_KEPT:
+        what, remedy = _cause(options, track, left_out, len(kept))
+        raise _failure(options, what, remedy, track, results)
+    kept_frames = _with_common_gain(
+        [replace(result.frame, split=splits[int(result.frame.name)]) for result in kept]
+    )
+    seen = count_seen_skin(rig, fitted.fit.shape_coefficients, kept_frames)
     with CaptureWriter(
         options.out,
         side=track.side,
-        shape_coefficients=fit.shape_coefficients,
+        shape_coefficients=fitted.fit.shape_coefficients,
         **header,  # type: ignore[arg-type]
     ) as writer:
-        for result, split in zip(kept, splits, strict=True):
-            writer.add(_with_split(result.frame, split))
-        _save_json(writer.file("skipped.json"), skipped)
-        _save_json(writer.file("fit.json"), _summary(results, fit))
-        _overview(results, set(skipped)).save(writer.file("overview.png"))
+        for frame in kept_frames:
+            writer.add(frame)
+        _save_json(writer.file("skipped.json"), _skipped(left_out))
+        summary = _summary(track, splits, results, kept_frames, left_out, seen)
+        _save_json(writer.file("fit.json"), _agreement(results, fitted.fit) | {"summary": summary})
+        save_file({"counts": seen.counts.int()}, writer.file("seen.safetensors"))
+        contact_sheet(_tiles(track, results)).save(writer.file("overview.png"))
     report(1.0, "done")
     return read_capture(options.out)
+
+
+def _laid_on(
+    track: Track, rig: Rig, options: VideoOptions, report: Progress
+) -> tuple[FittedHands, list[FittedFrame]]:
+    try:
+        masks = _found_masks(track, report)
+        fitted = _fitted(track, masks, rig, options, report)
+        gains = exposure_gains(track.glances, track.hands, track.picture_size)
+        guided = _guided_masks(track, fitted, rig, gains, report)
+    except CaptureError as error:
+        raise _failure(options, error.what, error.remedy, track, []) from error
+
+    def cropped(number: int) -> FittedFrame:
+        hand, mask = track.hands[number], guided[number]
+        return _result(hand, mask, rig, fitted, number, gains[number], options)
+
+    results = _on_all_cores(
+        cropped, range(len(guided)), lambda share: report(0.9 + 0.05 * share, "cropping")
+    )
+    return fitted, results
 
 
 def _found_masks(track: Track, report: Progress) -> list[HandMask]:
@@ -180,7 +296,30 @@ def _found_masks(track: Track, report: Progress) -> list[HandMask]:
     return _on_all_cores(
         lambda hand: find_mask(hand, colors),
         track.hands,
-        lambda share: report(0.4 + 0.25 * share, "cutting out the hand"),
+        lambda share: report(0.4 + 0.2 * share, "cutting out the hand"),
+    )
+
+
+@single_threaded()
+def _guided_masks(
+    track: Track,
+    fitted: FittedHands,
+    rig: Rig,
+    gains: Float[np.ndarray, "hands 3"],
+    report: Progress,
+) -> list[GuidedMask]:
+    report(0.8, "learning the colours again")
+    focal = fitted.fit.focal
+    meshes = _on_all_cores(
+        lambda number: placed_mesh(rig, fitted.vertices[number], focal, track.hands[number]),
+        range(len(track.hands)),
+        lambda share: None,
+    )
+    colors = learn_guided_colors(track.hands, meshes, gains)
+    return _on_all_cores(
+        lambda number: find_guided_mask(track.hands[number], meshes[number], colors, gains[number]),
+        range(len(track.hands)),
+        lambda share: report(0.8 + 0.1 * share, "cutting out the hand again"),
     )
 
 
@@ -218,8 +357,9 @@ def observations_of(track: Track) -> Observations:
 @single_threaded()
 def _fitted(
     track: Track, masks: list[HandMask], rig: Rig, options: VideoOptions, report: Progress
-) -> tuple[HandFit, list[FittedFrame]]:
-    report(0.65, "fitting the hand")
+) -> FittedHands:
+    """Lays the rig onto landmarks and masks: the one place that knows how."""
+    report(0.6, "fitting the hand")
     observations = observations_of(track)
     outlines = [
         mask_outline(mask.pixels, hand.window, float(scale))
@@ -227,39 +367,29 @@ def _fitted(
     ]
     matcher = OutlineMatcher(rig, outlines, track.picture_size)
     fit = fit_hands(rig, observations, options.fit, matcher)
-    report(0.85, "cropping")
     model = HandModel(rig)
-    vertices = model.all_vertices(fit)
-    errors = landmark_errors(model, observations, fit)
-
-    def cropped(number: int) -> FittedFrame:
-        hand, mask = track.hands[number], masks[number]
-        error_metres = float(errors[number] / observations.scale[number])
-        return _result(hand, mask, rig, fit, number, vertices[number], error_metres, options.size)
-
-    results = _on_all_cores(
-        cropped, range(len(masks)), lambda share: report(0.85 + 0.1 * share, "cropping")
-    )
-    return fit, results
+    errors = landmark_errors(model, observations, fit) / observations.scale
+    return FittedHands(fit, model.all_vertices(fit), errors)
 
 
 def _result(
     hand: TrackedHand,
-    mask: HandMask,
+    guided: GuidedMask,
     rig: Rig,
-    fit: HandFit,
+    fitted: FittedHands,
     number: int,
-    vertices: Float[Tensor, "vertices 3"],
-    error_metres: float,
-    size: int,
+    gain: Float[np.ndarray, "3"],
+    options: VideoOptions,
 ) -> FittedFrame:
     """One frame's crop, with its mask cut where the mesh ends."""
-    window = hand.window
+    window, size = hand.window, options.size
+    fit, vertices = fitted.fit, fitted.vertices[number]
     side = window.image.shape[0]
-    whole = window_camera(fit.focal, window.picture_size, window.corner, side / window.scale, side)
     rim = rig.rim.numpy()
-    places = project(whole, vertices)[0].numpy()
-    corner, box = _box(_before_wrist(mask.pixels, places[rim], places.mean(0)))
+    whole = window_camera(fit.focal, window.picture_size, window.corner, side / window.scale, side)
+    places = project(whole, vertices)[0].double().numpy()
+    before = wrist_line(places[rim], places.mean(0)).before_pixels(side) > 0
+    corner, box = _box(guided.mask.pixels & before & inside_picture(window))
     camera = window_camera(
         fit.focal,
         window.picture_size,
@@ -268,26 +398,96 @@ def _result(
         size,
     )
     zoom = np.eye(2) * (box / size)
-    image = resampled(window.image, zoom, np.array(corner), size)
-    grey = np.repeat((255 * mask.level[..., None]).round().astype(np.uint8), 3, axis=-1)
-    fine = _SUBPIXELS * size
-    full = resampled(grey, zoom / _SUBPIXELS, np.array(corner), fine)[..., 0] > 127
-    fine_camera = camera.resized(fine, fine)
-    mesh = silhouette(rig, vertices, fine_camera)
-    scale = pixels_per_metre(hand) * window.scale * fine / box
-    cut = _cut_mask(full, mesh, project(fine_camera, vertices)[0].numpy(), rim, scale)
-    iou = float((mesh & cut).sum() / max(1, int((mesh | cut).sum())))
+    image = resampled(window.image, zoom, np.array(corner), size).copy()
+    fine = resampled(
+        _grey(guided.mask.level), zoom / _SUBPIXELS, np.array(corner), _SUBPIXELS * size
+    )
+    shares = _shares(fine[..., 0] > 127)
+    known = resampled(_grey(guided.known), zoom, np.array(corner), size)[..., 0] == 255
+    was_seen = _is_in_view(window, corner, box, size)
+    image[~was_seen] = 128
+
+    fine_camera = camera.resized(_SUBPIXELS * size, _SUBPIXELS * size)
+    mesh = _shares(silhouette(rig, vertices, fine_camera))
+    in_crop = project(camera, vertices)[0].double().numpy()
+    line = wrist_line(in_crop[rim], in_crop.mean(0))
+    scale = camera.focal[0] / max(float(vertices[:, 2].median()), 0.02)
+    cut = cut_at_wrist(shares, line)
+    is_end = is_cut_unsure(mesh > 0.5, line, scale)
+    counted = was_seen & ~is_end
+    iou = float(
+        np.minimum(mesh, cut)[counted].sum() / max(1.0, np.maximum(mesh, cut)[counted].sum())
+    )
+    known &= was_seen & ~(is_end & (shares > 0))
+    outside, unknown = _missing(window, guided, rig, vertices, fit.focal)
+    error = float(fitted.landmark_errors[number])
+    factors = _confidence(hand, guided, iou, error)
     frame = Frame(
         name=f"{hand.index:06d}",
-        image=torch.from_numpy(image.copy()),
-        coverage=torch.from_numpy((255 * _shares(cut)).round().astype(np.uint8)),
+        image=torch.from_numpy(image),
+        coverage=torch.from_numpy((255 * cut * known).round().astype(np.uint8)),
         camera=camera,
         pose=fit.pose(number),
-        confidence=_confidence(hand, mask, iou, error_metres),
+        confidence=float(np.prod(list(factors.values()))),
         split="train",
         time=hand.time,
+        known=torch.from_numpy(known),
+        gain=torch.from_numpy(gain).float(),
     )
-    return FittedFrame(frame, _shares(mesh) > 0.5, iou, error_metres * scale / _SUBPIXELS)
+    pixels = float(np.ptp(hand.landmarks, axis=0).max())
+    reason = _reason(pixels, outside, unknown, guided, factors, iou, error, options.min_confidence)
+    return FittedFrame(
+        frame, mesh > 0.5, iou, error * scale, guided.edge_quality, outside, unknown, reason
+    )
+
+
+def _grey(values: np.ndarray) -> np.ndarray:
+    """Values in [0, 1] as a picture."""
+    grey = (255 * values.astype(np.float32)).round().astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=-1)
+
+
+def _is_in_view(
+    window: Window, corner: tuple[float, float], box: float, size: int
+) -> Bool[np.ndarray, "size size"]:
+    """Pixels of a crop of a window that lie wholly in the camera's picture, and in the window."""
+    step = box / size
+    sides = []
+    for axis in range(2):
+        first = corner[axis] + np.arange(size) * step
+        begin, end = (edge / window.scale + window.corner[axis] for edge in (first, first + step))
+        is_inside = (begin > -1e-6) & (end < window.picture_size[axis] + 1e-6)
+        sides.append(is_inside & (first > -1e-6) & (first + step < len(window.image) + 1e-6))
+    return sides[1][:, None] & sides[0][None, :]
+
+
+def _missing(
+    window: Window,
+    guided: GuidedMask,
+    rig: Rig,
+    vertices: Float[Tensor, "vertices 3"],
+    focal: float,
+) -> tuple[float, float]:
+    """Shares of the mesh's pixels beyond the camera's picture, and unknown inside of it."""
+    size, center = np.array(window.picture_size), np.array(window.picture_size) / 2
+    seen = vertices.double().numpy()
+    places = seen[:, :2] / np.maximum(seen[:, 2:], 0.02) * focal + center
+    low, high = places.min(0), places.max(0)
+    side = float((high - low).max())
+    start = (low + high) / 2 - side / 2
+    camera = window_camera(
+        focal, window.picture_size, (float(start[0]), float(start[1])), side, _COUNTED_SIDE
+    )
+    rows, columns = np.nonzero(silhouette(rig, vertices, camera))
+    if len(rows) == 0:
+        return 1.0, 0.0
+    points = (np.stack([columns, rows], axis=-1) + 0.5) * (side / _COUNTED_SIDE) + start
+    is_outside = ~((points >= 0) & (points <= size)).all(-1)
+    pixel = np.floor(window.from_picture(points)).astype(int)
+    is_far = ((pixel < 0) | (pixel >= len(guided.known))).any(-1)
+    pixel = pixel.clip(0, len(guided.known) - 1)
+    is_unknown = is_far | ~guided.known[pixel[:, 1], pixel[:, 0]]
+    return float(is_outside.mean()), float((is_unknown & ~is_outside).mean())
 
 
 def _shares(fine: Bool[np.ndarray, "fine fine"]) -> Float[np.ndarray, "side side"]:
@@ -296,56 +496,55 @@ def _shares(fine: Bool[np.ndarray, "fine fine"]) -> Float[np.ndarray, "side side
     return fine.reshape(side, _SUBPIXELS, side, _SUBPIXELS).mean(axis=(1, 3))
 
 
-def _confidence(hand: TrackedHand, mask: HandMask, iou: float, error_metres: float) -> float:
-    """How far a pose is to be trusted: 1 if outline, landmarks and tracker all agree."""
+def _confidence(
+    hand: TrackedHand, guided: GuidedMask, iou: float, error_metres: float
+) -> dict[str, float]:
+    """How far a pose is to be trusted: the product is 1 if outline, landmarks, tracker agree."""
     spread_metres = float(hand.spread.mean()) / pixels_per_metre(hand)
-    outline = np.clip((iou - 0.65) / 0.25, 0, 1)
-    landmarks = np.exp(-((error_metres / 0.008) ** 2))
-    agreement = np.exp(-((spread_metres / 0.015) ** 2))
-    is_clear = np.clip((mask.quality - 0.5) / 0.35, 0, 1)
-    presence = np.clip(hand.presence / 0.9, 0, 1)
-    return float(outline * landmarks * agreement * is_clear * presence)
+    return {
+        "outline": float(np.clip((iou - 0.65) / 0.25, 0, 1)),
+        "landmarks": float(np.exp(-((error_metres / 0.008) ** 2))),
+        "looks": float(np.exp(-((spread_metres / 0.015) ** 2))),
+        "edges": float(np.clip((guided.edge_quality - 0.45) / 0.3, 0, 1)),
+        "presence": float(np.clip(hand.presence / 0.9, 0, 1)),
+    }
 
 
-def _before_wrist(
-    mask: Bool[np.ndarray, "side side"],
-    rim: Float[np.ndarray, "rim 2"],
-    hand: Float[np.ndarray, "2"],
-    margin: float = 0.0,
-) -> Bool[np.ndarray, "side side"]:
-    """The part of a mask in front of the wrist line, by at least ``margin`` pixels."""
-    rows, columns = np.nonzero(mask)
-    centers = np.stack([columns, rows], axis=-1) + 0.5
-    before = ~is_behind_wrist(centers, rim, hand, margin)
-    result = np.zeros_like(mask)
-    result[rows[before], columns[before]] = True
-    return result
-
-
-def _cut_mask(
-    mask: Bool[np.ndarray, "side side"],
-    mesh: Bool[np.ndarray, "side side"],
-    places: Float[np.ndarray, "vertices 2"],
-    rim: Int[np.ndarray, "rim"],
-    scale: float,
-) -> Bool[np.ndarray, "side side"]:
-    """The mask without the forearm.
-
-    Behind the wrist line only what the mesh covers stays, just before it only what is close to
-    the mesh: a forearm that leaves at an angle would leave a spur there.
-
-    Args:
-        mask: hand and forearm.
-        mesh: pixels that the fitted hand covers.
-        places: its vertices, pixels.
-        rim: those at its end.
-        scale: pixels per metre at the hand.
-    """
-    center = places.mean(0)
-    sure = _before_wrist(mask, places[rim], center, _WRIST_BAND * scale)
-    doubtful = _before_wrist(mask, places[rim], center) & ~sure
-    close = ndimage.distance_transform_edt(~mesh) < _WRIST_SLACK * scale
-    return sure | (doubtful & close) | (mask & mesh)
+def _reason(
+    pixels: float,
+    outside: float,
+    unknown: float,
+    guided: GuidedMask,
+    factors: dict[str, float],
+    iou: float,
+    error_metres: float,
+    min_confidence: float,
+) -> LeftOut | None:
+    """Why a frame is to be left out, by what is most to blame."""
+    percent = round(100 * (1 - outside - unknown))
+    if outside + unknown > 1 - _SEEN_SHARE:
+        if outside >= unknown:
+            return LeftOut("border", f"only {percent} % of the hand is in the picture")
+        if guided.covered_share > unknown / 2:
+            return LeftOut("hidden", f"only {percent} % of the hand is seen, something hides it")
+        return LeftOut(
+            "background", f"only {percent} % of the hand can be told from what is behind it"
+        )
+    if pixels < _SMALLEST_HAND:
+        return LeftOut("small", f"the hand is {pixels:.0f} pixels large")
+    confidence = float(np.prod(list(factors.values())))
+    if confidence >= min_confidence:
+        return None
+    worst = min(factors, key=lambda name: factors[name])
+    texts = {
+        "outline": ("pose", f"mask and fitted hand overlap by {100 * iou:.0f} %"),
+        "landmarks": ("pose", f"landmarks and fitted hand are {1000 * error_metres:.0f} mm apart"),
+        "looks": ("pose", "the tracker's looks disagree (a fist, or a hand seen edge-on?)"),
+        "edges": ("background", "the hand's border follows no edge of the picture"),
+        "presence": (NO_HAND, "the tracker is not sure of a hand"),
+    }
+    kind, text = texts[worst]
+    return LeftOut(kind, f"{text}; confidence {confidence:.2f}")
 
 
 def _box(mask: Bool[np.ndarray, "side side"]) -> tuple[tuple[float, float], float]:
@@ -369,11 +568,101 @@ def held_out_splits(count: int) -> list[str]:
     return splits
 
 
-def _with_split(frame: Frame, split: str) -> Frame:
-    return Frame(**{**vars(frame), "split": split})
+def splits_by_index(track: Track) -> dict[int, str]:
+    """The split of every picture that was looked at, with a hand or without, by its index."""
+    indices = sorted([hand.index for hand in track.hands] + list(track.skipped))
+    return dict(zip(indices, held_out_splits(len(indices)), strict=True))
 
 
-def _summary(results: list[FittedFrame], fit: HandFit) -> dict[str, object]:
+def _left_out(track: Track, results: list[FittedFrame]) -> dict[str, LeftOut]:
+    """The reason of every picture that is not kept, by its name, in the order of time."""
+    found = {
+        f"{index:06d}": LeftOut(reason if reason in CAUSES else "pose", reason)
+        for index, reason in track.skipped.items()
+    }
+    for result in results:
+        if result.reason is not None:
+            found[result.frame.name] = result.reason
+    return dict(sorted(found.items()))
+
+
+def _skipped(left_out: dict[str, LeftOut]) -> dict[str, object]:
+    return {
+        "frames": {name: reason.text for name, reason in left_out.items()},
+        "reasons": dict(Counter(reason.kind for reason in left_out.values()).most_common()),
+    }
+
+
+def _with_common_gain(frames: list[Frame]) -> list[Frame]:
+    """The gains relative to the average of these frames."""
+    mean = torch.stack([frame.gain.double().log() for frame in frames]).mean(0)
+    return [
+        replace(frame, gain=((frame.gain.double().log() - mean).exp() * 1e4).round().float() / 1e4)
+        for frame in frames
+    ]
+
+
+def _cause(
+    options: VideoOptions, track: Track, left_out: dict[str, LeftOut], num_kept: int
+) -> tuple[str, str]:
+    """What to say where too few pictures are left: what was most often in the way."""
+    kinds = Counter(reason.kind for reason in left_out.values())
+    kind, count = kinds.most_common(1)[0]
+    brightness = [float(glance.image.mean()) for glance in track.glances]
+    if kind in ("pose", NO_HAND) and brightness and float(np.median(brightness)) < _DARK:
+        kind = "dark"
+    elif kind == "pose" and 1 - _CLEAR_VOTE < track.votes_right < _CLEAR_VOTE:
+        kind = "side"
+    total = len(track.hands) + len(track.skipped)
+    cause, remedy = CAUSES[kind]
+    return (
+        f"{options.file}: only {num_kept} of {total} pictures can be used, at least {_MIN_KEPT} "
+        f"are needed; in {count} of the others {cause}",
+        remedy,
+    )
+
+
+def _failure(
+    options: VideoOptions, what: str, remedy: str, track: Track, results: list[FittedFrame]
+) -> CaptureError:
+    """The error to raise; all pictures and their reasons lie beside the would-be capture."""
+    folder = _fresh_folder(options.out)
+    left_out = _left_out(track, results)
+    contact_sheet(_tiles(track, results)).save(folder / "overview.png")
+    _save_json(folder / "reasons.json", {"failed": what, "remedy": remedy} | _skipped(left_out))
+    return CaptureError(what, f"{remedy}\neach picture and its reason: {folder / 'overview.png'}")
+
+
+def _fresh_folder(out: Path) -> Path:
+    """A folder beside a name that nobody has used yet: with ``.failed``, or a number behind it."""
+    out.absolute().parent.mkdir(parents=True, exist_ok=True)
+    number = 1
+    while True:
+        ending = ".failed" if number == 1 else f".failed-{number}"
+        folder = out.with_name(out.name + ending)
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            number += 1
+            continue
+        return folder
+
+
+def _tiles(track: Track, results: list[FittedFrame]) -> list[Tile]:
+    """All pictures in the order of time: the fitted crop where there is one, else the whole."""
+    tiles = {}
+    for glance in track.glances:
+        reason = track.skipped.get(glance.index, "")
+        tiles[glance.index] = Tile(f"{glance.index:06d}", glance.image, reason)
+    for result in results:
+        frame = result.frame
+        title = f"{frame.name}  {frame.confidence:.2f}"
+        text = "" if result.reason is None else result.reason.text
+        tiles[int(frame.name)] = Tile(title, outlined(frame, result.mesh), text)
+    return [tiles[index] for index in sorted(tiles)]
+
+
+def _agreement(results: list[FittedFrame], fit: HandFit) -> dict[str, Any]:
     return {
         "focal_pixels": fit.focal,
         "mean_mask_iou": float(np.mean([result.mask_iou for result in results])),
@@ -382,38 +671,92 @@ def _summary(results: list[FittedFrame], fit: HandFit) -> dict[str, object]:
             result.frame.name: {
                 "confidence": round(result.frame.confidence, 4),
                 "mask_iou": round(result.mask_iou, 4),
+                "mask_quality": round(result.mask_quality, 4),
                 "landmark_error_pixels": round(result.landmark_error, 3),
+                "outside_share": round(result.outside_share, 4),
+                "unknown_share": round(result.unknown_share, 4),
             }
             for result in results
         },
     }
 
 
+def _summary(
+    track: Track,
+    splits: dict[int, str],
+    results: list[FittedFrame],
+    kept: list[Frame],
+    left_out: dict[str, LeftOut],
+    seen: SeenSkin,
+) -> dict[str, Any]:
+    """What a person wants to know of the capture, as JSON."""
+    names = {frame.name for frame in kept}
+    gains = torch.stack([frame.gain for frame in kept])
+    of_splits = {
+        split: {
+            "pictures": sum(value == split for value in splits.values()),
+            "kept": sum(frame.split == split for frame in kept),
+        }
+        for split in SPLITS
+        if split in splits.values()
+    }
+    outside = [result.outside_share for result in results if result.frame.name in names]
+    return {
+        "side": track.side,
+        "side_certainty": round(max(track.votes_right, 1 - track.votes_right), 3),
+        "pictures": len(splits),
+        "kept": len(kept),
+        "left_out": _skipped(left_out)["reasons"],
+        "splits": of_splits,
+        "border": {
+            "frames": sum(share > _TOUCHES for share in outside),
+            "largest_share": round(max(outside), 4),
+        },
+        "gain": {
+            "smallest": [round(value, 4) for value in gains.amin(0).tolist()],
+            "largest": [round(value, 4) for value in gains.amax(0).tolist()],
+        },
+        "skin_never_seen": {
+            "share": round(seen.unseen_share, 4),
+            "regions": seen.unseen_regions,
+        },
+    }
+
+
+def summary_lines(summary: dict[str, Any]) -> list[str]:
+    """A capture's summary, as ``fit.json`` has it, for people to read.
+
+    Args:
+        summary: side, frames kept and left out, border, exposure, skin that nobody saw.
+    """
+    other = {"left": "right", "right": "left"}[summary["side"]]
+    sure = round(100 * summary["side_certainty"])
+    lines = [
+        f"hand: {summary['side']} ({sure} % of the tracker's votes; --side {other} overrules it)",
+        f"frames: {summary['kept']} of {summary['pictures']} kept",
+    ]
+    for kind, count in summary["left_out"].items():
+        lines.append(f"  {count} left out: {CAUSES[kind][0]}")
+    parts = [
+        f"{split} {counts['kept']} of {counts['pictures']}"
+        for split, counts in summary["splits"].items()
+    ]
+    lines.append(f"splits: {', '.join(parts)}")
+    border = summary["border"]
+    lines.append(
+        f"border: the hand reaches beyond the picture in {border['frames']} kept frames, by at "
+        f"most {100 * border['largest_share']:.0f} % of it"
+    )
+    gain = summary["gain"]
+    low, high = min(gain["smallest"]), max(gain["largest"])
+    lines.append(f"exposure and white balance: {low:.2f} to {high:.2f} of the average")
+    skin = summary["skin_never_seen"]
+    names = "; ".join(skin["regions"])
+    lines.append(
+        f"skin never seen: {100 * skin['share']:.0f} %" + (f" (most of: {names})" if names else "")
+    )
+    return lines
+
+
 def _save_json(path: Path, content: object) -> None:
     path.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
-
-
-def _overview(results: list[FittedFrame], skipped: set[str]) -> Image.Image:
-    """Contact sheet: mask outline green, mesh outline red, what was left out framed in red."""
-    step = max(1, -(-len(results) // _SHEET_FRAMES))
-    shown = results[::step]
-    rows = -(-len(shown) // _SHEET_COLUMNS)
-    sheet = Image.new("RGB", (_SHEET_COLUMNS * _SHEET_TILE, rows * _SHEET_TILE))
-    for place, result in enumerate(shown):
-        tile = Image.fromarray(_drawn_outlines(result)).resize((_SHEET_TILE, _SHEET_TILE))
-        draw = ImageDraw.Draw(tile)
-        text = f"{result.frame.name}  {result.frame.confidence:.2f}"
-        draw.text((4, 3), text, fill="white", stroke_width=1, stroke_fill="black")
-        if result.frame.name in skipped:
-            draw.rectangle((0, 0, _SHEET_TILE - 1, _SHEET_TILE - 1), outline="red", width=3)
-        row, column = divmod(place, _SHEET_COLUMNS)
-        sheet.paste(tile, (column * _SHEET_TILE, row * _SHEET_TILE))
-    return sheet
-
-
-def _drawn_outlines(result: FittedFrame) -> UInt8[np.ndarray, "height width 3"]:
-    image = result.frame.image.numpy().copy()
-    mask = result.frame.mask.numpy()
-    image[mask ^ ndimage.binary_erosion(mask)] = (0, 255, 0)
-    image[result.mesh ^ ndimage.binary_erosion(result.mesh)] = (255, 40, 40)
-    return image

@@ -9,7 +9,7 @@ from handavatar.cli.failures import BAD_DATA
 
 def video(words: list[str]) -> int:
     """A video of one bare hand -> capture: track, mask, fit pose and shape."""
-    from handavatar.capture.video import VideoOptions, capture_video
+    from handavatar.capture.video import VideoOptions, capture_video, summary_lines
     from handavatar.cli.arguments import parse
     from handavatar.train.progress import Progress
 
@@ -19,8 +19,12 @@ def video(words: list[str]) -> int:
             options, progress=lambda share, stage: progress.update(round(100 * share), stage)
         )
     skipped = json.loads((options.out / "skipped.json").read_text(encoding="utf-8"))
-    for name, reason in skipped.items():
+    for name, reason in skipped["frames"].items():
         print(f"skipped {name}: {reason}")
+    fit = json.loads((options.out / "fit.json").read_text(encoding="utf-8"))
+    for line in summary_lines(fit["summary"]):
+        print(line)
+    print(f"look at: {options.out / 'overview.png'}")
     print(f"capture: {options.out}\nnext: handavatar train {options.out}")
     return 0
 

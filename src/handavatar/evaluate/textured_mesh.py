@@ -124,7 +124,7 @@ def fit_textured_mesh(
     indices, weights, normals, truth = [], [], [], []
     for frame in frames:
         points = mesh_points(avatar, texels, frame, rays)
-        image = frame.image.flatten(0, 1)[points.pixels].float() / 255 / frame.gain
+        image = frame.colors.flatten(0, 1)[points.pixels]
         # Pixels that the hand covers in part show background as well.
         kept = ((frame.alpha > 0.99) & frame.known).flatten()[points.pixels]
         indices.append(points.neighbours.indices[kept])

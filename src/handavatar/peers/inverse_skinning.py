@@ -104,8 +104,13 @@ class RaySamples:
 
 
 @torch.no_grad()
-def ray_samples(avatar: HandAvatar, frame: Frame, stride: int = 1) -> RaySamples:
-    """Looks along every ``stride``-th pixel near the personal mesh, in both directions."""
+def ray_samples(
+    avatar: HandAvatar, frame: Frame, stride: int = 1, only_known: bool = False
+) -> RaySamples:
+    """Looks along every ``stride``-th pixel near the personal mesh, in both directions.
+
+    On request only along those of which the frame knows what they show.
+    """
     camera, pose = frame.camera, frame.pose
     hand = avatar.personal(pose)
     posed = hand.posed(pose)
@@ -114,6 +119,8 @@ def ray_samples(avatar: HandAvatar, frame: Frame, stride: int = 1) -> RaySamples
     near = nn.functional.max_pool2d(covered, size, stride=1, padding=_MARGIN)[0, 0] > 0
     grid = torch.zeros_like(near)
     grid[::stride, ::stride] = True
+    if only_known:
+        grid &= frame.known
     pixels = (near & grid).flatten().nonzero()[:, 0]
     rays = rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1)[pixels])
     along = (posed.vertices - rays.origins[:1]) @ camera.camera_from_world[2, :3]
@@ -171,7 +178,7 @@ def fit_inverse_skinning(
     """
     torch.manual_seed(seed)
     field, generator = CanonicalField(), torch.Generator().manual_seed(seed)
-    known = [ray_samples(avatar, frame, stride) for frame in frames]
+    known = [ray_samples(avatar, frame, stride, only_known=True) for frame in frames]
 
     def loss() -> Tensor:
         chosen = torch.randint(len(frames), (_FRAMES,), generator=generator).tolist()
@@ -182,7 +189,7 @@ def fit_inverse_skinning(
             parts.append(part)
             poses.append(_rotations(frame.pose, len(part.places)))
             coverage = frame.alpha.flatten()[part.pixels][:, None]
-            image = frame.image.flatten(0, 1)[part.pixels].float() / 255
+            image = frame.colors.flatten(0, 1)[part.pixels]
             truths.append(torch.cat([image * coverage, coverage], dim=-1))
         found = seen_along(field, joined(parts), torch.cat(poses))
         return (found - torch.cat(truths)).abs().mean()

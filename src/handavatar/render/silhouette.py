@@ -98,7 +98,10 @@ def silhouette_loss(
 
 
 def soft_mask(
-    coverage: Float[Tensor, "height width"], size: int, softness: float = 1.0
+    coverage: Float[Tensor, "height width"],
+    size: int,
+    softness: float = 1.0,
+    known: Bool[Tensor, "height width"] | None = None,
 ) -> Float[Tensor, "size size"]:
     """A mask with ``size`` pixels along a side, as :func:`soft_silhouette` would cover it.
 
@@ -106,12 +109,40 @@ def soft_mask(
         coverage: of each pixel by the hand, in [0, 1].
         size: pixels along a side of the result.
         softness: pixels of the result.
+        known: where the coverage means anything; elsewhere the nearest known pixel speaks, and
+            :func:`known_at` tells which pixels of the result may be used.
     """
     distance = interpolate(
-        signed_distance(coverage)[None, None], (size, size), mode="bilinear", antialias=True
+        known_distance(coverage, known)[0][None, None],
+        (size, size),
+        mode="bilinear",
+        antialias=True,
     )[0, 0]
     distance = distance * (size / coverage.shape[-1])
     return torch.sigmoid(-distance * distance.abs() / softness**2)
+
+
+def known_at(
+    coverage: Float[Tensor, "height width"],
+    known: Bool[Tensor, "height width"],
+    size: int,
+    softness: float = 1.0,
+) -> Bool[Tensor, "size size"]:
+    """Which pixels of a :func:`soft_mask` follow from known pixels alone.
+
+    All pixels that it covers are known; and the outline that softens it, if one is so near, is.
+
+    Args:
+        coverage: as there.
+        known: as there.
+        size: as there.
+        softness: as there.
+    """
+    distance, has_outline = known_distance(coverage, known)
+    reach = WINDOW * softness * coverage.shape[-1] / size
+    usable = known & (has_outline | (distance.abs() > reach))
+    shares = interpolate(usable.float()[None, None], (size, size), mode="area")[0, 0]
+    return shares > 0.999
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,17 +193,55 @@ def signed_distance(coverage: Float[Tensor, "height width"]) -> Float[Tensor, "h
     Args:
         coverage: in [0, 1].
     """
-    covered = coverage.cpu().numpy()
+    distance, _ = _distance_and_nearest(coverage.cpu().numpy())
+    return torch.from_numpy(distance).to(coverage)
+
+
+def known_distance(
+    coverage: Float[Tensor, "height width"], known: Bool[Tensor, "height width"] | None
+) -> tuple[Float[Tensor, "height width"], Bool[Tensor, "height width"]]:
+    """:func:`signed_distance`, and where it is the distance to an outline that was seen.
+
+    What the coverage says of unknown pixels has no influence: there the mask goes on as the nearest
+    known pixel has it, so that no outline runs along the end of what is known. Where the nearest
+    outline lies in the unknown, or the pixel itself does, the second result is false.
+
+    Args:
+        coverage: in [0, 1].
+        known: where it means anything; None for everywhere.
+    """
+    if known is None or bool(known.all()):
+        return signed_distance(coverage), torch.ones_like(coverage, dtype=torch.bool)
+    is_seen = known.cpu().numpy()
+    if not is_seen.any():
+        nothing = torch.zeros_like(coverage)
+        return signed_distance(nothing), nothing.bool()
+    beside = distance_transform_edt(~is_seen, return_distances=False, return_indices=True)
+    covered = coverage.cpu().numpy()[tuple(beside)]
+    covered = np.where(is_seen, covered, covered >= 0.5)
+    distance, nearest = _distance_and_nearest(covered)
+    # An outline beside the unknown may be its end: one pixel further in it is believed.
+    is_believed = ~binary_dilation(~is_seen)
+    has_outline = is_seen if nearest is None else is_seen & is_believed[tuple(nearest)]
+    return (
+        torch.from_numpy(distance).to(coverage),
+        torch.from_numpy(has_outline).to(coverage.device),
+    )
+
+
+def _distance_and_nearest(
+    covered: Float[np.ndarray, "height width"],
+) -> tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "2 height width"] | None]:
+    """As :func:`signed_distance`, and the nearest pixel of the outline; None if there is none."""
     inside = covered >= 0.5
     if inside.all() or not inside.any():
-        size = float(sum(coverage.shape))
-        return torch.full(coverage.shape, -size if inside.any() else size, device=coverage.device)
+        size = float(sum(covered.shape))
+        return np.full(covered.shape, -size if inside.any() else size), None
     is_partial = (covered > 0) & (covered < 1)
-    is_known = is_partial | ((covered == 1) & binary_dilation(covered == 0))
-    away, nearest = distance_transform_edt(~is_known, return_indices=True)
+    is_border = is_partial | ((covered == 1) & binary_dilation(covered == 0))
+    away, nearest = distance_transform_edt(~is_border, return_indices=True)
     passing = 0.5 - covered[tuple(nearest)]
-    distance = np.where(inside, passing - away, passing + away)
-    return torch.from_numpy(distance).to(coverage)
+    return np.where(inside, passing - away, passing + away), nearest
 
 
 @dataclass(frozen=True, eq=False)

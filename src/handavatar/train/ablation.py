@@ -317,9 +317,7 @@ def fitted_geometry(capture: Capture, shape: Shape, method: Method, seed: int) -
         seen,
         views,
         [_turned(avatar, tests[number], replace(settings, num_samples=256)) for number in chosen],
-        mean_color(
-            [frame.image.float() / 255 for frame in frames], [frame.mask for frame in frames]
-        ),
+        mean_color([frame.colors for frame in frames], [frame.mask for frame in frames]),
         [_hidden(view.samples, avatar) for view in views],
     )
 
@@ -544,7 +542,7 @@ def _column(shading: Shading, views: list[View]) -> Float[Tensor, "height width 
 def _true_column(capture: Capture, frames: list[Frame]) -> Float[Tensor, "height width 3"]:
     parts = []
     for frame in frames:
-        color = frame.image.float() / 255 * frame.alpha[..., None]
+        color = frame.shown.float() / 255 * frame.alpha[..., None]
         shading = torch.zeros_like(color)
         if knows_split(capture):
             shading = _truth(capture, "shading", frame.name)[..., None].expand(-1, -1, 3)

@@ -31,7 +31,7 @@ class SeenSamples:
         light: what a light in each direction brings to each sample; half precision.
         frames: frame number of each sample.
         starts: where each pixel's samples begin; its samples are neighbours in all of the above.
-        colors: true colour of each pixel, in [0, 1].
+        colors: true colour of each pixel, in [0, 1], at the capture's average exposure.
         alpha: how much of each pixel the hand covers.
         rotations: pose of each frame, axis-angle.
     """
@@ -54,7 +54,8 @@ def find_seen_samples(
 ) -> SeenSamples:
     """Evaluates every ``stride``-th pixel of the hand, in both directions, of every frame.
 
-    Pixels at the hand's border are left out: what they mix with the background is unknown.
+    Pixels at the hand's border are left out: what they mix with the background is unknown. So are
+    those of which nothing is known.
     """
     weights, directed, indices, shares, normals, lights = [], [], [], [], [], []
     numbers, counts, colors, alphas = [], [], [], []
@@ -79,7 +80,7 @@ def find_seen_samples(
         lights.append(seen.neighbours.interpolated(state.light)[is_kept].half())
         numbers.append(torch.full_like(seen.rays[is_kept], number))
         counts.append(torch.bincount(seen.rays, minlength=len(x))[is_covered])
-        colors.append(frame.image[y, x].to(alpha)[is_covered] / 255)
+        colors.append(frame.colors[y, x].to(alpha)[is_covered])
         alphas.append(alpha[is_covered])
     starts = torch.cat(counts).cumsum(0)
     return SeenSamples(

@@ -7,7 +7,7 @@ picture's outline lies outside of it. Rays beside the border see the sum itself.
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar, RenderSettings
@@ -15,7 +15,7 @@ from handavatar.capture.frames import Frame
 from handavatar.field.occupancy import HandCodes
 from handavatar.geometry.cameras import Rays, pixel_centers, rays_through_pixels
 from handavatar.jobs.threads import mapped
-from handavatar.render.silhouette import signed_distance
+from handavatar.render.silhouette import known_distance
 from handavatar.train.losses import border_loss
 from handavatar.train.pretraining import descend
 
@@ -74,24 +74,31 @@ def _borders(avatar: HandAvatar, frames: list[Frame]) -> list[_Border]:
     def border(frame: Frame) -> _Border:
         pose, camera = frame.pose.to(avatar.device), frame.camera.to(avatar.device)
         codes = avatar.occupancy.encode(avatar.parts, avatar.personal(pose).posed(pose))
-        x, y = _beside(frame.alpha).unbind(-1)
+        x, y = _beside(frame.alpha, frame.known).unbind(-1)
         rays = rays_through_pixels(camera, pixel_centers(camera)[y, x])
         return _Border(codes, rays, frame.alpha[y, x].to(avatar.device))
 
     return [border for border in mapped(border, frames) if len(border.coverage)]
 
 
-def _beside(coverage: Float[Tensor, "height width"]) -> Int[Tensor, "pixels 2"]:
-    y, x = (signed_distance(coverage).abs() < BORDER_REACH).nonzero().unbind(-1)
+def _beside(
+    coverage: Float[Tensor, "height width"], known: Bool[Tensor, "height width"] | None
+) -> Int[Tensor, "pixels 2"]:
+    distance, was_seen = known_distance(coverage, known)
+    y, x = (was_seen & (distance.abs() < BORDER_REACH)).nonzero().unbind(-1)
     return torch.stack([x, y], dim=-1)
 
 
 def border_pixels(
-    coverage: Float[Tensor, "height width"], count: int, generator: torch.Generator
+    coverage: Float[Tensor, "height width"],
+    count: int,
+    generator: torch.Generator,
+    known: Bool[Tensor, "height width"] | None = None,
 ) -> Int[Tensor, "pixels 2"]:
     """Pixels (x, y) at most ``BORDER_REACH`` from the border of the mask, drawn evenly.
 
-    As many as asked for, or as there are.
+    As many as asked for, or as there are. Where a mask ends because nothing is known beside it, it
+    has no border; None stands for a mask that is known everywhere.
     """
-    pixels = _beside(coverage)
+    pixels = _beside(coverage, known)
     return pixels[torch.randperm(len(pixels), generator=generator)[:count]]

@@ -20,7 +20,6 @@ from handavatar.field.shading import CueSet, OrientedCues, PaperCues, TracedCues
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.rigs import find_rig
-from handavatar.render.silhouette import soft_mask
 from handavatar.train.appearance import (
     SeenSamples,
     appearance_loss,
@@ -38,7 +37,13 @@ from handavatar.train.optimizer_state import (
     optimizer_tensors,
     restore_optimizer,
 )
-from handavatar.train.outlines import EdgeSet, corrected_pose, fit_outlines, shape_losses
+from handavatar.train.outlines import (
+    EdgeSet,
+    corrected_pose,
+    fit_outlines,
+    shape_losses,
+    small_mask,
+)
 from handavatar.train.personal_occupancy import fit_occupancy
 from handavatar.train.pretraining import wide_and_narrow
 from handavatar.train.prior import SHIPPED_PRIOR, load_prior
@@ -330,9 +335,7 @@ def begin_training(
     )
     load_prior(avatar.occupancy, options.prior)
     avatar.start_from_color(
-        mean_color(
-            [frame.image.float() / 255 for frame in frames], [frame.mask for frame in frames]
-        )
+        mean_color([frame.colors for frame in frames], [frame.mask for frame in frames])
     )
     avatar.occupancy.encoder.requires_grad_(False)
     is_corrected = capture.is_tracked and method.corrects_poses
@@ -538,8 +541,10 @@ def frame_losses(
     pose = corrected_pose(training.corrections, frame, number, device)
     state = avatar.prepare(pose)
     camera = frame.camera.to(device)
-    mask = soft_mask(frame.alpha, method.silhouette_size).to(device)
-    losses = shape_losses(state.posed, state.offsets, camera, mask, edges)
+    mask, is_counted = small_mask(frame, method.silhouette_size)
+    if is_counted is not None:
+        is_counted = is_counted.to(device)
+    losses = shape_losses(state.posed, state.offsets, camera, mask.to(device), edges, is_counted)
     if training.corrections is not None:
         losses["pose"] = 0.01 * training.corrections.penalty(number)
 
@@ -558,7 +563,7 @@ def frame_losses(
         patch_pixels(frame.mask, method.patch_size, method.patch_strides, generator)
         for _ in range(method.patches)
     ]
-    border = border_pixels(frame.alpha, method.border_pixels, generator)
+    border = border_pixels(frame.alpha, method.border_pixels, generator, frame.known)
     x, y = torch.cat([*patches, border]).unbind(-1)
     near = avatar.near_mesh(state, camera, settings.mask_margin)[y, x].nonzero()[:, 0]
     rays = rays_through_pixels(camera, pixel_centers(camera)[y, x][near])
@@ -574,14 +579,21 @@ def frame_losses(
     x, y, coverage = x[in_patches], y[in_patches], coverage[in_patches]
     color, alpha = color[in_patches], alpha[in_patches]
     background = torch.rand(3, generator=generator).to(device)
-    truth = frame.image[y, x].to(device).float() / 255
+    truth = frame.colors[y, x].to(device)
     truth = background + coverage[:, None] * (truth - background)
     color = color + (1 - alpha[:, None]) * background
+    # Of what is not known both show the same: it has no loss, and its neighbours keep their weight.
+    is_known = frame.known[y, x].to(device)[:, None]
+    truth, color = (
+        torch.where(is_known, truth, background),
+        torch.where(is_known, color, background),
+    )
     losses["color"] = color_loss(color, truth)
     size = (method.patches, method.patch_size, method.patch_size)
     distance = perceptual(color.unflatten(0, size), truth.unflatten(0, size)).mean()
     losses["perceptual"] = method.perceptual_weight * distance
-    losses["squared_error"] = (color.detach() - truth).square().mean()
+    squared = (color.detach() - truth).square().mean(-1).sum()
+    losses["squared_error"] = squared / is_known.sum().clamp_min(1)
     return losses
 
 

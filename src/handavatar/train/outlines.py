@@ -7,7 +7,7 @@ whose outline is nearly that of the fine one, a frame costs a twentieth of a joi
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from handavatar.alignment import aligned_pose
@@ -19,7 +19,7 @@ from handavatar.geometry.meshes import unique_edges
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, Rig
 from handavatar.jobs.threads import mapped
-from handavatar.render.silhouette import silhouette_loss, soft_mask, soft_silhouette
+from handavatar.render.silhouette import known_at, silhouette_loss, soft_mask, soft_silhouette
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.losses import offset_loss
 from handavatar.train.progress import Progress
@@ -58,6 +58,7 @@ def shape_losses(
     camera: Camera,
     mask: Float[Tensor, "size size"],
     edges: EdgeSet,
+    known: Bool[Tensor, "size size"] | None = None,
 ) -> dict[str, Tensor]:
     """L_shape on a small mask, and what keeps the personal offsets smooth.
 
@@ -67,10 +68,13 @@ def shape_losses(
         camera: of the frame, of any resolution.
         mask: of the frame, from :func:`~handavatar.render.silhouette.soft_mask`.
         edges: of the same mesh.
+        known: pixels of the mask that count; None for all.
 
     Source: paper Sec. 3.1, L_shape.
     """
     coverage = soft_silhouette(posed.vertices, posed.rig.faces, camera.resized(*mask.shape))
+    if known is not None:
+        coverage, mask = coverage[known], mask[known]
     return {
         "silhouette": silhouette_loss(coverage, mask),
         "offsets": offset_loss(offsets, edges.edges, edges.spacing),
@@ -103,7 +107,7 @@ def fit_outlines(
         return
     generator = torch.Generator().manual_seed(seed)
     edges = EdgeSet.of(avatar.base_rig)
-    masks = [soft_mask(frame.alpha, size) for frame in frames]
+    masks = [small_mask(frame, size) for frame in frames]
     optimizer = torch.optim.Adam(avatar.shape.parameters(), lr=_RATE, betas=(0.9, 0.99))
     passes = rounds * visits + (rounds + 1 if corrections else 0)
     steps = rounds * visits * -(-len(frames) // _BATCH)
@@ -124,6 +128,19 @@ def fit_outlines(
         if corrections is not None:
             _align(avatar, corrections, frames, progress, done)
     optimizer.zero_grad(set_to_none=True)
+
+
+def small_mask(
+    frame: Frame, size: int
+) -> tuple[Float[Tensor, "size size"], Bool[Tensor, "size size"] | None]:
+    """What :func:`shape_losses` compares with: a frame's soft mask, and which pixels count.
+
+    The second is None where all do.
+    """
+    mask = soft_mask(frame.alpha, size, known=frame.known)
+    if bool(frame.known.all()):
+        return mask, None
+    return mask, known_at(frame.alpha, frame.known, size)
 
 
 def corrected_pose(
@@ -151,6 +168,7 @@ def _align(
             frame.alpha,
             _ALIGNMENT_STEPS,
             corrections(number, pose),
+            frame.known,
         )
         corrections.set(number, pose, found)
 
@@ -165,7 +183,7 @@ def _shape_step(
     avatar: HandAvatar,
     corrections: PoseCorrections | None,
     frames: list[Frame],
-    masks: list[Float[Tensor, "size size"]],
+    masks: list[tuple[Float[Tensor, "size size"], Bool[Tensor, "size size"] | None]],
     edges: EdgeSet,
     chosen: list[int],
 ) -> float:
@@ -175,12 +193,14 @@ def _shape_step(
     def differentiated(number: int) -> tuple[tuple[Tensor, ...], float]:
         frame = frames[number]
         pose = corrected_pose(corrections, frame, number, avatar.device)
-        camera, mask = frame.camera.to(avatar.device), masks[number].to(avatar.device)
+        camera, (mask, known) = frame.camera.to(avatar.device), masks[number]
+        mask = mask.to(avatar.device)
+        known = None if known is None else known.to(avatar.device)
         with torch.enable_grad():
             rest = avatar.coarse_rig.shaped(avatar.coefficients)
             offsets = avatar.shape(rest, pose.rotations)
             posed = personal_hand(rest, offsets).posed(pose)
-            losses = shape_losses(posed, offsets, camera, mask, edges)
+            losses = shape_losses(posed, offsets, camera, mask, edges, known)
             gradient = torch.autograd.grad(torch.stack(list(losses.values())).sum(), parameters)
         return gradient, float(losses["silhouette"].detach())
 

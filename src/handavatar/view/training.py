@@ -169,7 +169,7 @@ class Watch:
         frame = self._frame(view.frame)
         left, top, side = _square(frame)
         box = (left, top, left + side, top + side)
-        picture = Image.fromarray(frame.image.numpy()).transform(
+        picture = Image.fromarray(frame.shown.numpy()).transform(
             (view.size, view.size), Image.Transform.EXTENT, box, Image.Resampling.BILINEAR
         )
         pixels = np.asarray(picture)
