@@ -43,8 +43,9 @@ class FitOptions:
     """Metres by which a tracked landmark is off, beside what the tracker itself admits."""
     outline_error: float = 0.0012
     """Metres between the outlines of mesh and mask in a good fit."""
-    acceleration: float = 0.030
-    """Metres a landmark strays from even motion between two frames."""
+    acceleration: float = 16.0
+    """Hand sizes a second, each second, by which a landmark's speed changes: in hand sizes, so that
+    a smaller hand is not a calmer one, and in seconds, so that frame rates do not matter."""
     landmark_steps: int = 250
     """Steps of the first stage."""
     outline_steps: int = 240
@@ -403,10 +404,19 @@ def _shared_energy(
     if frames < 3:
         return energy
     landmarks = model.landmarks(fit)
-    gaps = observations.times.diff()
-    is_even = (gaps[1:] < 1.6 * gaps.median()) & (gaps[:-1] < 1.6 * gaps.median())
-    bend = (landmarks[2:] - 2 * landmarks[1:-1] + landmarks[:-2]) / options.acceleration
-    return energy + 0.5 * (_robust(bend.norm(dim=-1)).sum(-1) * is_even).sum()
+    before, after = (
+        observations.times[1:-1] - observations.times[:-2],
+        observations.times.diff()[1:],
+    )
+    gap = (before + after)[:, None, None] / 2
+    speed = (landmarks[1:-1] - landmarks[:-2]) / before[:, None, None]
+    next_speed = (landmarks[2:] - landmarks[1:-1]) / after[:, None, None]
+    bend = next_speed - speed
+    size = landmarks.detach()[:, [9]].sub(landmarks.detach()[:, [0]]).norm(dim=-1).mean() * 2
+    # In units of the hand's size: divided by it, gradient and all.
+    palm = (landmarks[:, 9] - landmarks[:, 0]).norm(dim=-1).mean() * 2
+    expected = (options.acceleration * gap.square()[..., 0]).hypot(options.landmark_error / size)
+    return energy + 0.5 * _robust(bend.norm(dim=-1) / palm * gap[..., 0] / expected).sum()
 
 
 def _robust(ratio: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:

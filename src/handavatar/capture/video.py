@@ -43,8 +43,14 @@ from handavatar.capture.masks import (
     learn_colors,
     pixels_per_metre,
 )
-from handavatar.capture.outlines import OutlineMatcher, mask_outline, silhouette
+from handavatar.capture.outlines import silhouette
 from handavatar.capture.overview import Tile, contact_sheet, outlined
+from handavatar.capture.registration import (
+    observe_hands,
+    posed_vertices,
+    register_hands,
+    window_view,
+)
 from handavatar.capture.seen_skin import SeenSkin, count_seen_skin
 from handavatar.capture.tracking import (
     NO_HAND,
@@ -55,6 +61,7 @@ from handavatar.capture.tracking import (
     track_hand,
 )
 from handavatar.capture.windows import Window, resampled, window_camera
+from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.cameras import project
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
@@ -66,6 +73,8 @@ Progress = Callable[[float, str], None]
 """Told the share of the work that is done, in [0, 1], and what is being done."""
 
 _BOX_SCALE = 1.3
+_WRIST_MARGIN = 0.008
+"""Metres before the rig's end from where on masks are believed."""
 _SUBPIXELS = 3
 _HELD_OUT = ((0.28, 0.08), (0.68, 0.08))
 _MIN_KEPT = 8
@@ -109,7 +118,9 @@ class VideoOptions:
     rig: str = "open-hand"
     """The hand to lay onto the pictures: open-hand, an imported one (mano-right) or its file."""
     fit: FitOptions = field(default_factory=FitOptions)
-    """How the hand is fitted."""
+    """How the hand is first fitted, to landmarks alone."""
+    register: RegisterOptions = field(default_factory=RegisterOptions)
+    """How the hand is laid onto masks and colours."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,11 +131,14 @@ class FittedHands:
         fit: shape, poses, focal length.
         vertices: of the rig in every frame, metres, camera axes.
         landmark_errors: mean distance of fitted and tracked landmarks, metres.
+        covariances: of the poses' errors as far as landmarks and motion tell them; zeros where
+            nothing was asked.
     """
 
     fit: HandFit
     vertices: Float[Tensor, "frames vertices 3"]
     landmark_errors: Float[Tensor, "frames"]
+    covariances: Float[Tensor, "frames 51 51"]
 
 
 @dataclass(frozen=True)
@@ -274,9 +288,31 @@ def _laid_on(
 ) -> tuple[FittedHands, list[FittedFrame]]:
     try:
         masks = _found_masks(track, report)
-        fitted = _fitted(track, masks, rig, options, report)
+        report(0.5, "fitting the hand")
+        fitted = _fitted_to_landmarks(track, rig, options)
         gains = exposure_gains(track.glances, track.hands, track.picture_size)
+        fitted = _registered(
+            track,
+            masks,
+            fitted,
+            _known_before_wrist(track, fitted, rig),
+            gains,
+            rig,
+            replace(options.register, color_sigmas=()),
+            lambda share: report(0.55 + 0.15 * share, "laying the hand onto the masks"),
+        )
         guided = _guided_masks(track, fitted, rig, gains, report)
+        before = _known_before_wrist(track, fitted, rig)
+        fitted = _registered(
+            track,
+            [mask.mask for mask in guided],
+            fitted,
+            [first & mask.known for first, mask in zip(before, guided, strict=True)],
+            gains,
+            rig,
+            replace(options.register, restarts=1, is_wide=False),
+            lambda share: report(0.75 + 0.15 * share, "laying the hand onto masks and colours"),
+        )
     except CaptureError as error:
         raise _failure(options, error.what, error.remedy, track, []) from error
 
@@ -296,7 +332,7 @@ def _found_masks(track: Track, report: Progress) -> list[HandMask]:
     return _on_all_cores(
         lambda hand: find_mask(hand, colors),
         track.hands,
-        lambda share: report(0.4 + 0.2 * share, "cutting out the hand"),
+        lambda share: report(0.4 + 0.1 * share, "cutting out the hand"),
     )
 
 
@@ -308,7 +344,7 @@ def _guided_masks(
     gains: Float[np.ndarray, "hands 3"],
     report: Progress,
 ) -> list[GuidedMask]:
-    report(0.8, "learning the colours again")
+    report(0.7, "learning the colours again")
     focal = fitted.fit.focal
     meshes = _on_all_cores(
         lambda number: placed_mesh(rig, fitted.vertices[number], focal, track.hands[number]),
@@ -319,7 +355,7 @@ def _guided_masks(
     return _on_all_cores(
         lambda number: find_guided_mask(track.hands[number], meshes[number], colors, gains[number]),
         range(len(track.hands)),
-        lambda share: report(0.8 + 0.1 * share, "cutting out the hand again"),
+        lambda share: report(0.7 + 0.05 * share, "cutting out the hand again"),
     )
 
 
@@ -355,21 +391,57 @@ def observations_of(track: Track) -> Observations:
 
 
 @single_threaded()
-def _fitted(
-    track: Track, masks: list[HandMask], rig: Rig, options: VideoOptions, report: Progress
-) -> FittedHands:
-    """Lays the rig onto landmarks and masks: the one place that knows how."""
-    report(0.6, "fitting the hand")
+def _fitted_to_landmarks(track: Track, rig: Rig, options: VideoOptions) -> FittedHands:
+    """Where the landmarks alone have the hand, with its shape and the focal length."""
     observations = observations_of(track)
-    outlines = [
-        mask_outline(mask.pixels, hand.window, float(scale))
-        for hand, mask, scale in zip(track.hands, masks, observations.scale, strict=True)
-    ]
-    matcher = OutlineMatcher(rig, outlines, track.picture_size)
-    fit = fit_hands(rig, observations, options.fit, matcher)
-    model = HandModel(rig)
-    errors = landmark_errors(model, observations, fit) / observations.scale
-    return FittedHands(fit, model.all_vertices(fit), errors)
+    fit = fit_hands(rig, observations, options.fit)
+    vertices = HandModel(rig).all_vertices(fit)
+    return _judged_fit(rig, observations, fit, vertices, torch.zeros(len(vertices), 51, 51))
+
+
+def _registered(
+    track: Track,
+    masks: Sequence[HandMask],
+    before: FittedHands,
+    known: Sequence[Bool[np.ndarray, "side side"]],
+    gains: Float[np.ndarray, "hands 3"],
+    rig: Rig,
+    options: RegisterOptions,
+    report: Callable[[float], None],
+) -> FittedHands:
+    """The hand laid onto landmarks, masks and colours: the one place that knows how."""
+    seen = observations_of(track)
+    observations = observe_hands(track.hands, masks, known, gains, seen, before.fit.focal)
+    fit, found = register_hands(rig, before.fit, observations, options, report)
+    covariances = torch.linalg.inv(found.information.double()).float()
+    return _judged_fit(rig, seen, fit, posed_vertices(found), covariances)
+
+
+def _judged_fit(
+    rig: Rig,
+    observations: Observations,
+    fit: HandFit,
+    vertices: Float[Tensor, "frames vertices 3"],
+    covariances: Float[Tensor, "frames 51 51"],
+) -> FittedHands:
+    errors = landmark_errors(HandModel(rig), observations, fit) / observations.scale
+    return FittedHands(fit, vertices, errors, covariances)
+
+
+def _known_before_wrist(
+    track: Track, fitted: FittedHands, rig: Rig
+) -> list[Bool[np.ndarray, "side side"]]:
+    """Pixels of the camera's picture in front of the wrist: what lies behind is the forearm's."""
+    rim = rig.rim.numpy()
+    found = []
+    for hand, vertices in zip(track.hands, fitted.vertices, strict=True):
+        view = window_view(hand, fitted.fit.focal)
+        places = project(view, vertices)[0].double().numpy()
+        line = wrist_line(places[rim], places.mean(0))
+        margin = _WRIST_MARGIN * view.focal[0] / max(float(vertices[:, 2].median()), 0.02)
+        before = line.before_pixels(view.width) > margin
+        found.append(before & inside_picture(hand.window))
+    return found
 
 
 def _result(
@@ -433,6 +505,7 @@ def _result(
         time=hand.time,
         known=torch.from_numpy(known),
         gain=torch.from_numpy(gain).float(),
+        covariance=fitted.covariances[number],
     )
     pixels = float(np.ptp(hand.landmarks, axis=0).max())
     reason = _reason(pixels, outside, unknown, guided, factors, iou, error, options.min_confidence)

@@ -153,7 +153,8 @@ def linearise_frame(
         )
     )
     total = _Sum(NUM_UNKNOWNS + points.num_shared)
-    _add_outlines(total, points, hand, skeleton, vertices, seen, blurred, outlier, options)
+    if options.outline_points > 0:
+        _add_outlines(total, points, hand, skeleton, vertices, seen, blurred, outlier, options)
     if colors is not None:
         _add_colors(
             total,
@@ -230,7 +231,7 @@ def _add_outlines(
     positions = skeleton.positions(rest)
     pixels, _, moving = pixel_jacobian(camera, positions)
     values, slopes = blurred.sample(pixels)
-    is_known = picture.is_known(pixels)
+    is_known = picture.sees_outline(pixels)
     moving = moving @ skeleton.jacobian(rest)
     weights = outline.lengths * is_known
     weights = weights * (options.outline_points / outline.lengths.sum())

@@ -40,13 +40,8 @@ def habit_residuals(
         turns = torch.zeros_like(rotations).requires_grad_()
         turned = matrix_from_axis_angle(rotations) @ matrix_from_axis_angle(turns)
         angles = angles_from_rotations(rig, axis_angle_from_matrix(turned))
-        slopes = torch.stack(
-            [
-                torch.autograd.grad(angles[..., i].sum(), turns, retain_graph=True)[0]
-                for i in range(3)
-            ],
-            dim=2,
-        )
+        sums = [angles[..., number].sum() for number in range(3)]
+        slopes = [torch.autograd.grad(total, turns, retain_graph=True)[0] for total in sums]
         angles = angles.detach()
     least, greatest = limit_bounds(angles)
     width = greatest - least

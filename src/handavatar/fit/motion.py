@@ -52,6 +52,13 @@ class MotionTerms:
             gradient.index_add_(0, self.first + offset, self.weights[:, offset] * self.residuals)
         return gradient
 
+    def curvature(self, num_frames: int) -> Float[Tensor, "frames 51"]:
+        """Diagonal of the whole matrix: what holds each frame if its neighbours stand still."""
+        diagonal = torch.zeros(num_frames, NUM_UNKNOWNS)
+        for offset in range(3):
+            diagonal.index_add_(0, self.first + offset, self.weights[:, offset].square())
+        return diagonal
+
     def banded(self, blocks: Float[Tensor, "frames 51 51"]) -> np.ndarray:
         """Lower band of the whole matrix: each frame's own block, and what joins neighbours."""
         num_frames = len(blocks)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, grid_sample, normalize, pad
 
 from handavatar.geometry.cameras import Camera
-from handavatar.render.silhouette import signed_distance
+from handavatar.render.silhouette import known_distance
 
 _MOST_BORDER_POINTS = 240
 
@@ -24,6 +24,7 @@ class FramePicture:
         color: sRGB in [0, 1], divided by the frame's gain.
         hand: pixels that belong to the hand, known ones alone.
         known: of which anything is known.
+        has_outline: where the outline that is nearest was seen.
         distance: pixels from the outline of the hand, negative inside.
         border: points on the outline, where both of its sides are known, pixels.
         border_normals: unit, away from the hand.
@@ -33,6 +34,7 @@ class FramePicture:
     color: Float[Tensor, "height width 3"]
     hand: Bool[Tensor, "height width"]
     known: Bool[Tensor, "height width"]
+    has_outline: Bool[Tensor, "height width"]
     distance: Float[Tensor, "height width"]
     border: Float[Tensor, "border 2"]
     border_normals: Float[Tensor, "border 2"]
@@ -54,17 +56,21 @@ class FramePicture:
             known: false where neither is known.
             gain: of the channels.
         """
-        distance = blur(signed_distance(coverage)[..., None], 1.0)[..., 0]
+        distance, has_outline = known_distance(coverage, known)
+        distance = blur(distance[..., None], 1.0)[..., 0]
         border, normals = _border_of(distance, known)
         hand = (coverage > 0.9) & known
-        return FramePicture(camera, color / gain, hand, known, distance, border, normals)
+        return FramePicture(
+            camera, color / gain, hand, known, has_outline, distance, border, normals
+        )
 
     def is_known(self, pixels: Float[Tensor, "points 2"]) -> Bool[Tensor, "points"]:
         """Whether anything is known of the pixels of these points; not beyond the picture."""
-        height, width = self.known.shape
-        column, row = pixels.floor().long().unbind(-1)
-        is_inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-        return is_inside & self.known[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+        return _holds(self.known, pixels)
+
+    def sees_outline(self, pixels: Float[Tensor, "points 2"]) -> Bool[Tensor, "points"]:
+        """Whether the outline that is nearest to these points was seen."""
+        return _holds(self.has_outline, pixels)
 
     def blurred(self, sigma: float) -> "BlurredPicture":
         """Colours blurred among the hand's own pixels, so that no background leaks in."""
@@ -86,6 +92,16 @@ class BlurredPicture:
     ) -> tuple[Float[Tensor, "points 4"], Float[Tensor, "points 4 2"]]:
         """Bilinear values and slopes over one pixel; beyond the picture its border goes on."""
         return sample_with_slope(self.channels, pixels)
+
+
+def _holds(
+    picture: Bool[Tensor, "height width"], pixels: Float[Tensor, "points 2"]
+) -> Bool[Tensor, "points"]:
+    """What a picture says at image positions; no beyond it."""
+    height, width = picture.shape
+    column, row = pixels.floor().long().unbind(-1)
+    is_inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    return is_inside & picture[row.clamp(0, height - 1), column.clamp(0, width - 1)]
 
 
 def _border_of(

@@ -48,6 +48,8 @@ class RegisterOptions:
     """Degrees by which a joint of a tracked pose is off, where the capture does not say."""
     learns_pose_error: bool = True
     """Whether this error is learned from all frames together."""
+    is_wide: bool = True
+    """Whether the start may be off by a finger's width."""
     restarts: int = 4
     """Times that badly explained frames are begun anew."""
     color_sigmas: tuple[float, ...] = (3.0, 1.5)
@@ -70,7 +72,11 @@ class Registered:
         poses: of all frames.
         covariances: of their errors, as the energy's curvature has them: joints' turns (radians),
             then translation (metres).
-        hand: rest hand with its shape as found.
+        hand: rest hand of the first frame with its shape as found.
+        shape_change: of the rig's coefficients.
+        offsets: of the tracker's landmarks, metres; none without landmarks.
+        information: what landmarks, motion and the tracked poses say of each pose, without masks
+            and colours: an inverse covariance.
         energies: how badly each frame is explained; a good one has about as many as the best.
         pose_error: degrees by which the tracked poses were off, as learned.
         colors: of the surface's points, if they were looked at.
@@ -79,6 +85,9 @@ class Registered:
     poses: HandPose
     covariances: Float[Tensor, "frames 51 51"]
     hand: ShapedHand
+    shape_change: Float[Tensor, "shapes"]
+    offsets: Float[Tensor, "offsets"]
+    information: Float[Tensor, "frames 51 51"]
     energies: Float[Tensor, "frames"]
     pose_error: float
     colors: SkinColors | None
@@ -107,7 +116,7 @@ def observe(
 
 @torch.no_grad()
 def register(
-    hand: ShapedHand,
+    hands: Sequence[ShapedHand],
     observations: Sequence[Observation],
     tracked: HandPose,
     information: Float[Tensor, "frames 51 51"] | None,
@@ -120,7 +129,8 @@ def register(
     """Lays one hand onto all frames.
 
     Args:
-        hand: rest hand to begin with.
+        hands: rest hand to begin with, one for all frames or one for each; one shape is added to
+            all of them.
         observations: of the frames.
         tracked: poses to begin with.
         information: inverse covariances of their errors; None where nobody knows: then they are
@@ -132,7 +142,7 @@ def register(
         progress: told how far it is.
     """
     report = progress or (lambda share: None)
-    rig = hand.rig
+    rig = hands[0].rig
     space = ShapeSpace.around(rig, options.coefficient_sigma) if learns_shape else fixed_shape(rig)
     generator = torch.Generator().manual_seed(options.seed)
     surface = sample_surface_evenly(rig.template_vertices, rig.faces, _NUM_POINTS, generator)
@@ -141,7 +151,7 @@ def register(
     num_shapes = len(space.sigmas)
 
     def points_of(shared: Float[Tensor, "shared"], frame: int) -> HandPoints:
-        shaped = space.shaped(hand, shared[:num_shapes])
+        shaped = space.shaped(hands[frame if len(hands) > 1 else 0], shared[:num_shapes])
         landmarks = landmark_rest(shaped, space, shared[num_shapes:]) if has_landmarks else none
         return HandPoints(shaped, space, surface, landmarks)
 
@@ -166,7 +176,7 @@ def register(
         poses=tracked,
         shared=shared,
     )
-    for outlier in (_WIDE, _MIDDLE):
+    for outlier in (_WIDE, _MIDDLE) if options.is_wide else (_MIDDLE,):
         descent.step_poses(Look(_FINE, outlier), 4)
     report(0.15)
     descent.step_shape(Look(_FINE, _MIDDLE), 4)
@@ -196,6 +206,9 @@ def register(
         descent.poses,
         descent.covariances(look),
         points_of(descent.shared, 0).hand,
+        descent.shared[: rig.shape_directions.shape[-1] if learns_shape else 0],
+        descent.shared[num_shapes:],
+        descent.tracked_information(),
         descent.energies(look),
         error,
         colors,

@@ -137,6 +137,33 @@ class Descent:
         here = self._linearised(look, self.poses, self.shared)
         return torch.linalg.inv(here.pose_blocks().double()).float()
 
+    def tracked_information(self) -> Float[Tensor, "frames 51 51"]:
+        """What landmarks, motion and the tracked poses say of each pose; neither masks nor colours.
+
+        Whoever goes on from the poses found, with masks and colours of their own, holds them by
+        this.
+        """
+        blind = replace(self.options, outline_points=0.0)
+        look = Look(0.7, 1.0)
+
+        def seen(frame: int) -> Tensor:
+            part = linearise_frame(
+                self.points_of(self.shared, frame),
+                _at(self.poses, frame),
+                self.observations[frame],
+                self.blurred(frame, look.sigma),
+                None,
+                look.color_error,
+                look.sigma,
+                look.outlier,
+                blind,
+            )
+            return part.hessian[:NUM_UNKNOWNS, :NUM_UNKNOWNS]
+
+        found = torch.stack(mapped(seen, range(len(self.observations)))) + self.information
+        times = self.times if self.is_sequence else self.times[:0]
+        return found + torch.diag_embed(motion_terms(self.poses, times).curvature(len(found)))
+
     def step_poses(self, look: Look, steps: int) -> None:
         """Descends in the poses; every frame keeps what is best for it."""
         here = self._linearised(look, self.poses, self.shared)
@@ -226,12 +253,8 @@ class _Whole:
 
     def pose_blocks(self) -> Float[Tensor, "frames 51 51"]:
         """Each frame's own matrix with its neighbours held still."""
-        blocks = self.hessian[:, :NUM_UNKNOWNS, :NUM_UNKNOWNS].clone()
-        diagonal = torch.zeros(len(blocks), NUM_UNKNOWNS)
-        for offset in range(3):
-            weights = self.motion.weights[:, offset].square()
-            diagonal.index_add_(0, self.motion.first + offset, weights)
-        return blocks + torch.diag_embed(diagonal)
+        blocks = self.hessian[:, :NUM_UNKNOWNS, :NUM_UNKNOWNS]
+        return blocks + torch.diag_embed(self.motion.curvature(len(blocks)))
 
     def merged(self, is_other: Bool[Tensor, "frames"], other: "_Whole") -> "_Whole":
         """Some frames of another."""
