@@ -32,6 +32,7 @@ from handavatar.capture.windows import Window
 from handavatar.geometry.cameras import project
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.rig import Rig
+from handavatar.jobs.files import read_marker
 
 
 @pytest.mark.parametrize("count", [8, 30, 207, 600])
@@ -72,6 +73,7 @@ def test_a_video_without_a_hand_says_so_and_shows_its_pictures(tmp_path: Path) -
         assert Image.open(tmp_path / folder / "overview.png").size[0] > 1000
         reasons = json.loads((tmp_path / folder / "reasons.json").read_text())
         assert reasons["reasons"] == {"no hand found": 4} and len(reasons["frames"]) == 4
+        assert read_marker(tmp_path / folder)["kind"] == "failed capture"
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"wall.mp4", "out.failed", "out.failed-2"}
 

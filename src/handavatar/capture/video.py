@@ -65,7 +65,7 @@ from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.cameras import project
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
-from handavatar.jobs.files import files_named
+from handavatar.jobs.files import FolderKind, files_named, mark_folder
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -181,6 +181,9 @@ CAUSES: dict[str, tuple[str, str]] = {
     NO_HAND: ("no hand is seen", "record one bare hand, whole, larger than a sixth of the picture"),
 }
 """What goes wrong with a picture, and what to do about it."""
+
+FAILED_CAPTURE = FolderKind("failed capture", ("overview.png", "reasons.json"))
+"""The folder that shows why a video could not be used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -700,6 +703,7 @@ def _failure(
 ) -> CaptureError:
     """The error to raise; all pictures and their reasons lie beside the would-be capture."""
     folder = _fresh_folder(options.out)
+    mark_folder(folder, FAILED_CAPTURE)
     left_out = _left_out(track, results)
     contact_sheet(_tiles(track, results)).save(folder / "overview.png")
     _save_json(folder / "reasons.json", {"failed": what, "remedy": remedy} | _skipped(left_out))
