@@ -780,7 +780,10 @@ def _summary(
     outside = [result.outside_share for result in results if result.frame.name in names]
     return {
         "side": track.side,
-        "side_certainty": round(max(track.votes_right, 1 - track.votes_right), 3),
+        # Of the side that was taken: low where --side overruled the tracker.
+        "side_votes": round(
+            track.votes_right if track.side == "right" else 1 - track.votes_right, 3
+        ),
         "pictures": len(splits),
         "kept": len(kept),
         "left_out": _skipped(left_out)["reasons"],
@@ -807,7 +810,7 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         summary: side, frames kept and left out, border, exposure, skin that nobody saw.
     """
     other = {"left": "right", "right": "left"}[summary["side"]]
-    sure = round(100 * summary["side_certainty"])
+    sure = round(100 * summary["side_votes"])
     lines = [
         f"hand: {summary['side']} ({sure} % of the tracker's votes; --side {other} overrules it)",
         f"frames: {summary['kept']} of {summary['pictures']} kept",
