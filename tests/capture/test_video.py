@@ -164,7 +164,7 @@ def _made_video(
 def test_a_folder_in_use_is_refused_before_any_work(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("keep me")
     with pytest.raises(CaptureError, match="not empty"):
-        capture_video(VideoOptions(tmp_path / "no.mp4", tmp_path))
+        capture_video(VideoOptions(Path("no.mp4"), tmp_path))
     assert (tmp_path / "mine.txt").read_text() == "keep me"
 
 
