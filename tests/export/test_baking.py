@@ -19,7 +19,7 @@ from handavatar.export.baking import (
     colors_at_vertices,
     mean_light,
 )
-from handavatar.export.chart import charted
+from handavatar.render.chart import charted
 from handavatar.export.surface import average_hand
 from handavatar.field.anchors import nearest_anchors
 from handavatar.geometry.cameras import Camera, look_at, project

@@ -13,7 +13,6 @@ from handavatar.avatar import HandAvatar, RenderSettings
 from handavatar.capture.motion import middle_of_hand, placed
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
-from handavatar.export.chart import Texels, texels_of
 from handavatar.field.anchors import Neighbours, nearest_anchors
 from handavatar.geometry.cameras import Rays
 from handavatar.geometry.colors import eight_bits, linear_from_srgb
@@ -21,6 +20,7 @@ from handavatar.geometry.meshes import SurfacePoints
 from handavatar.geometry.rotations import invert_rigid, matrix_from_axis_angle
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
 from handavatar.hand.rig import ShapedHand
+from handavatar.render.chart import Texels, texels_of
 
 NUM_LIGHT_POSES = 20
 """Poses, and as many turns of the wrist, whose light is averaged: an anchor's mean over them is
