@@ -73,23 +73,36 @@ class DetailTexture(nn.Module):
     ) -> Float[Tensor, "points 2"]:
         """Where on the chart (u, v) the surface is nearest to points, without gradient.
 
-        Of the vertices around the nearest anchor the nearest one is taken, and of its faces the
-        nearest.
-
         Args:
             vertices: of the posed fine mesh, metres.
             points: near the surface, metres.
             neighbours: nearest anchors of the points.
         """
+        faces, weights = self.nearest(vertices, points, neighbours)
+        return (self.corners[faces] * weights[..., None]).sum(1)
+
+    @torch.no_grad()
+    def nearest(
+        self,
+        vertices: Float[Tensor, "vertices 3"],
+        points: Float[Tensor, "points 3"],
+        neighbours: Neighbours,
+    ) -> tuple[Int[Tensor, "points"], Float[Tensor, "points 3"]]:
+        """The face nearest to each point, and where on it, as weights of its corners.
+
+        Of the vertices around the nearest anchor the two nearest are taken, and of their faces the
+        nearest; where faces meet at an angle, the place on it is nearly the nearest one.
+        """
         first, second, third = vertices[self.faces].unbind(1)
         along, across = second - first, third - first
         dual_along, dual_across = _dual_sides(along, across)
-        found = []
+        found, weights = [], []
         for start in range(0, max(len(points), 1), _POINTS_AT_ONCE):
             part = points[start : start + _POINTS_AT_ONCE]
             near = self.around[neighbours.indices[start : start + _POINTS_AT_ONCE, 0]]
-            closest = (vertices[near] - part[:, None]).square().sum(-1).argmin(1, keepdim=True)
-            faces = self.incident[near.gather(1, closest)[:, 0]]
+            distances = (vertices[near] - part[:, None]).square().sum(-1)
+            closest = distances.topk(2, dim=1, largest=False).indices
+            faces = self.incident[near.gather(1, closest)].flatten(1)
             away = part[:, None] - first[faces]
             u = (away * dual_along[faces]).sum(-1).clamp_min(0)
             v = (away * dual_across[faces]).sum(-1).clamp_min(0)
@@ -98,10 +111,9 @@ class DetailTexture(nn.Module):
             off = away - u[..., None] * along[faces] - v[..., None] * across[faces]
             best = off.square().sum(-1).argmin(1, keepdim=True)
             u, v = u.gather(1, best), v.gather(1, best)
-            corners = self.corners[faces.gather(1, best)[:, 0]]
-            weights = torch.cat([1 - u - v, u, v], dim=1)
-            found.append((corners * weights[..., None]).sum(1))
-        return torch.cat(found)
+            found.append(faces.gather(1, best)[:, 0])
+            weights.append(torch.cat([1 - u - v, u, v], dim=1))
+        return torch.cat(found), torch.cat(weights)
 
 
 def detailed(

@@ -46,9 +46,10 @@ _FINE = 5e-3
 _AT_ONCE = 32768
 _FADE = 8
 """Passes of a mean over 5 x 5 texels by which what was seen runs out into what was not."""
-_LEVELS = 3
-"""The texture is learned as a sum of so many, each half as fine as the one before."""
-_RATE, _DECAY = 1e-2, 0.1
+_LEVELS = (2, 4)
+"""What is learned on top of what was unwrapped is a sum of textures so many times coarser: single
+texels, which few pixels see, would learn noise."""
+_RATE, _DECAY = 1e-3, 0.1
 _SSIM_WEIGHT = 0.2
 _ROUGHNESS_WEIGHT = 0.02
 _SEEN = 0.05
@@ -395,8 +396,8 @@ def learn_texels(
         return start
     size = len(start)
     levels = [
-        torch.zeros(max(size >> level, 1), max(size >> level, 1), 3, device=start.device)
-        for level in range(_LEVELS)
+        torch.zeros(max(size // coarser, 1), max(size // coarser, 1), 3, device=start.device)
+        for coarser in _LEVELS
     ]
     for level in levels:
         level.requires_grad_(True)

@@ -72,7 +72,7 @@ class Unwrapped:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Of one view: weights of faces, their pixels per uv, and the depth that hides what is behind."""
+    """Of one view: weights of faces, their pixels per uv, and from what depth on all is hidden."""
 
     weights: Float[Tensor, "faces"]
     pixels_per_uv: Float[Tensor, "faces 2 2"]
