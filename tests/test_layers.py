@@ -50,7 +50,7 @@ MAY_IMPORT = {
     }.items()
 }
 # Heavy or optional packages that a function may import when it needs them.
-OPTIONAL_EXTRAS = {"mediapipe", "cv2", "mitsuba", "drjit"}
+OPTIONAL_EXTRAS = {"mediapipe", "cv2", "mitsuba", "drjit", "h5py"}
 # Modules that import such a package (triton) at their top.
 OPTIONAL_MODULES = {
     "handavatar.field.fused",

@@ -284,6 +284,7 @@ def unwrap_frames(
     )
     found = unwrap_pictures(pictures, rig.faces, texels, corners)
     residual = texels.filled(found.residual * (found.seen / (found.seen + _SEEN))[:, None])
+    residual = residual * believed_share(residual, pictures)
     seen = torch.zeros(size, size)
     seen[texels.rows, texels.columns] = found.seen
     on_skin = face_cross_products(rig.template_vertices, rig.faces).norm(dim=-1)
@@ -320,11 +321,29 @@ def _unwrap_view(avatar: HandAvatar, frame: Frame, view: DetailView) -> UnwrapVi
         residual=fine_part(wanted, is_known, sigma),
         places=view.places.cpu(),
         is_known=is_known,
-        camera=camera.cropped(view.left, view.top, width, height),
+        camera=camera.cropped(float(view.left), float(view.top), float(width), float(height)),
         vertices=vertices,
         sharpness=sharpness,
         fit_error=outline_error(vertices, avatar.rig.to("cpu").faces, frame),
     )
+
+
+def believed_share(residual: Float[Tensor, "size size 3"], views: list[UnwrapView]) -> float:
+    """By how much unwrapped texels are to be multiplied so that they fit all pictures best.
+
+    Less than one where frames disagree: half of the amplitude of a line that is now here and now
+    there is less wrong than all of it.
+
+    Args:
+        residual: what was unwrapped.
+        views: what it was unwrapped from.
+    """
+    product = square = 0.0
+    for view in views:
+        found = texture_at(residual, view.places[view.is_known]).double()
+        product += float((found * view.residual[view.is_known]).sum())
+        square += float(found.square().sum())
+    return min(max(product / square, 0.0), 1.0) if square > 0 else 0.0
 
 
 def fine_part(
@@ -460,7 +479,7 @@ def _patch_loss(
     perceptual: PerceptualLoss,
     perceptual_weight: float,
 ) -> Float[Tensor, ""]:
-    loss = color_loss(found, truth)
+    loss = color_loss(found.flatten(0, 1), truth.flatten(0, 1))
     if min(found.shape[:2]) >= _SMALLEST_PATCH:
         loss = loss + _SSIM_WEIGHT * (1 - ssim_map(found, truth).mean())
         loss = loss + perceptual_weight * perceptual(found[None], truth[None])[0]
