@@ -15,7 +15,8 @@ MAY_IMPORT = {
     for name, allowed in {
         "geometry": "",
         "hand": "geometry",
-        "render": "geometry",
+        # A texture's chart is that of a rig.
+        "render": "geometry hand",
         "capture": "geometry hand render",
         "field": "geometry hand",
         "edit": "hand field",
@@ -30,7 +31,7 @@ MAY_IMPORT = {
         "train": "geometry hand capture field render avatar plain alignment evaluate processes",
         # Prior art, for a table alone.
         "peers": "geometry hand capture field render avatar evaluate train",
-        # A texture's chart is rasterised; words of an edit mean what they mean elsewhere.
+        # Words of an edit mean what they mean elsewhere.
         "export": "geometry hand capture field render edit avatar retouch unfinished",
         # Its fluid pictures bake the fields on the mesh; its others are what `animate` makes. What
         # a trainer leaves for others to see is read where it is written.

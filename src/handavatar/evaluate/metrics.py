@@ -26,6 +26,8 @@ _WINDOW_SIGMA = 1.5
 _WINDOW_RADIUS = 5
 _DETAIL_BORDER = 2.0
 """Pixels at the masks' border that are not asked for fine detail."""
+_LEAST_DETAIL = 1e-5
+"""Standard deviation below which detail is rounding."""
 _LUMINANCE_CONSTANT = 0.01**2
 _CONTRAST_CONSTANT = 0.03**2
 
@@ -312,8 +314,9 @@ def detail_ratio(frames: Sequence[JudgedFrame]) -> float:
     two of a mask's border do not count. Zero where the photographs have no detail.
     """
     rendered, truth = _details(frames)
+    least = _LEAST_DETAIL * math.sqrt(truth.numel())
     deviation = float(truth.norm())
-    return float(rendered.norm()) / deviation if deviation > 1e-12 else 0.0
+    return float(rendered.norm()) / deviation if deviation > least else 0.0
 
 
 def detail_correlation(frames: Sequence[JudgedFrame]) -> float:
@@ -322,8 +325,11 @@ def detail_correlation(frames: Sequence[JudgedFrame]) -> float:
     Pearson correlation of what :func:`detail_ratio` compares. Zero where there is no detail.
     """
     rendered, truth = _details(frames)
-    norm = float(rendered.norm() * truth.norm())
-    return float((rendered * truth).sum()) / norm if norm > 1e-12 else 0.0
+    least = _LEAST_DETAIL * math.sqrt(truth.numel())
+    first, second = float(rendered.norm()), float(truth.norm())
+    if min(first, second) <= least:
+        return 0.0
+    return float((rendered * truth).sum()) / (first * second)
 
 
 def _details(frames: Sequence[JudgedFrame]) -> tuple[Tensor, Tensor]:
