@@ -21,7 +21,7 @@ from handavatar.avatar import (
     Rendering,
     RenderSettings,
 )
-from handavatar.edit import Edit, bones_named
+from handavatar.edit import Edit, Paint, bones_named
 from handavatar.field.anchors import Neighbours
 from handavatar.field.shading import CueSet, OrientedCues, TracedCues
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
@@ -466,3 +466,67 @@ def test_a_failed_save_leaves_the_old_file(
     with pytest.raises(OSError, match="disk full"):
         small_avatar.save(file)
     assert file.read_bytes() == before
+
+
+# --- detail ---------------------------------------------------------------------------------------
+
+
+def _with_detail(avatar: HandAvatar, tmp_path: Path, strength: float = 0.3) -> HandAvatar:
+    avatar.save(tmp_path / "plain.safetensors")
+    detailed = HandAvatar.load(tmp_path / "plain.safetensors")
+    texture = detailed.give_texture(64)
+    with torch.no_grad():
+        texture.texels.copy_(strength * torch.randn(64, 64, 3))
+    return detailed
+
+
+def test_a_texture_of_zeros_changes_no_bit(
+    small_avatar: HandAvatar, rendering: Rendering, tmp_path: Path
+) -> None:
+    assert small_avatar.texture is None
+    assert not any(name.startswith("texture") for name in small_avatar.state_dict())
+    detailed = _with_detail(small_avatar, tmp_path, 0.0)
+    _assert_equal(detailed.render(bent_pose(2), camera_above(24), settings=FEW), rendering)
+
+
+def test_detail_changes_colour_and_albedo_alone(
+    small_avatar: HandAvatar, rendering: Rendering, tmp_path: Path
+) -> None:
+    detailed = _with_detail(small_avatar, tmp_path)
+    found = detailed.render(bent_pose(2), camera_above(24), settings=FEW)
+    for name in ("illumination", "normal", "depth", "alpha"):
+        assert torch.equal(getattr(found, name), getattr(rendering, name)), name
+    for name in ("color", "albedo"):
+        assert not torch.equal(getattr(found, name), getattr(rendering, name)), name
+    inside = rendering.alpha > 0.98
+    factor = found.albedo[inside] / rendering.albedo[inside]
+    assert 0.05 < float(factor.log().std()) < 0.3
+    batch = detailed.render_batch([bent_pose(2)], [camera_above(24)], settings=FEW)[0]
+    _assert_equal(batch, found)
+
+
+def test_edits_come_after_the_detail(small_avatar: HandAvatar, tmp_path: Path) -> None:
+    detailed = _with_detail(small_avatar, tmp_path)
+    count = len(detailed.anchor_corners)
+    coat = Paint(torch.full((count, 3), 0.25), torch.ones(count))
+    found = detailed.render(bent_pose(2), camera_above(24), Edit(paint=coat), FEW)
+    covered = found.alpha > 0.5
+    painted = found.albedo[covered] / found.alpha[covered][:, None]
+    torch.testing.assert_close(painted, torch.full_like(painted, 0.25), atol=1e-4, rtol=0)
+
+
+def test_detail_is_saved_and_read_back(small_avatar: HandAvatar, tmp_path: Path) -> None:
+    detailed = _with_detail(small_avatar, tmp_path)
+    detailed.save(tmp_path / "detailed.safetensors")
+    for found in (
+        HandAvatar.load(tmp_path / "detailed.safetensors"),
+        small_avatar.reloaded(tmp_path / "detailed.safetensors"),
+    ):
+        assert found.texture is not None and detailed.texture is not None
+        assert torch.equal(found.texture.texels, detailed.texture.texels)
+        _assert_equal(
+            found.render(bent_pose(2), camera_above(24), settings=FEW),
+            detailed.render(bent_pose(2), camera_above(24), settings=FEW),
+        )
+    assert small_avatar.texture is None
+    assert detailed.reloaded(tmp_path / "plain.safetensors").texture is None

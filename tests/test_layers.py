@@ -17,7 +17,8 @@ MAY_IMPORT = {
         # Files and folders of a long command; knows no hand.
         "jobs": "",
         "hand": "geometry",
-        "render": "geometry",
+        # A texture's chart is that of a rig.
+        "render": "geometry hand",
         # A hand laid onto pictures.
         "fit": "geometry jobs hand render",
         "capture": "geometry jobs hand render fit",
@@ -43,7 +44,7 @@ MAY_IMPORT = {
         "bench": "geometry jobs hand fit capture render evaluate train synthetic",
         # Prior art, for a table alone.
         "peers": "geometry jobs hand fit capture field render avatar evaluate train",
-        # A texture's chart is rasterised; words of an edit mean what they mean elsewhere.
+        # Words of an edit mean what they mean elsewhere.
         "export": "geometry hand capture field render edit avatar retouch jobs",
         # Its fluid pictures bake the fields on the mesh; its others are what `animate` makes. What
         # a trainer leaves for others to see is read where it is written.
@@ -62,7 +63,7 @@ MAY_IMPORT = {
     }.items()
 }
 # Heavy or optional packages that a function may import when it needs them.
-OPTIONAL_EXTRAS = {"mediapipe", "cv2", "mitsuba", "drjit"}
+OPTIONAL_EXTRAS = {"mediapipe", "cv2", "mitsuba", "drjit", "h5py"}
 # Modules that import such a package (triton) at their top.
 OPTIONAL_MODULES = {
     "handavatar.field.fused",

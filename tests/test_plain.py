@@ -1,5 +1,6 @@
 """The fast renderer against the slow, obvious one: values and gradients, wherever a ray may go."""
 
+import copy
 import math
 from dataclasses import replace
 
@@ -167,3 +168,15 @@ def test_the_two_pass_gradient_is_the_whole_gradient(small_avatar: HandAvatar) -
         # float32 through a dozen layers and back. The offsets' common shift is undone at the wrist:
         # its gradient (shape.mlp.output.bias) is a sum that cancels, known to 1e-5.
         assert float((ours - theirs).norm()) <= 1e-4 * float(theirs.norm()) + 1e-5, name
+
+
+def test_so_it_is_with_detail(small_avatar: HandAvatar) -> None:
+    avatar = copy.deepcopy(small_avatar)
+    texture = avatar.give_texture(64)
+    with torch.no_grad():
+        texture.texels.copy_(0.2 * torch.randn(64, 64, 3))
+        without = small_avatar.render_rays(
+            small_avatar.prepare(bent_pose(0)), _rays(camera_above(6)), EVERYTHING
+        )
+    values = _assert_alike(avatar, bent_pose(0), camera_above(6))
+    assert float((values.albedo - without.albedo).abs().max()) > 0.02

@@ -33,6 +33,7 @@ from handavatar.field.shading import (
     directed_occupancy,
 )
 from handavatar.field.shape import ShapeOffsets, personal_hand
+from handavatar.field.texture import DetailTexture
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
 from handavatar.hand.parts import finer_rig
@@ -40,6 +41,7 @@ from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import RIG_ARRAYS, PosedHand, Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
 from handavatar.jobs.threads import mapped
+from handavatar.render.chart import charted
 from handavatar.render.rasterize import covered_pixels
 from handavatar.render.sampling import depths_along, intervals_through_boxes
 from handavatar.render.skylight import even_directions, sky_light
@@ -164,6 +166,7 @@ class VisibleSamples:
         weights: in the ray; with gradient where gradients are enabled.
         rays: ray of each sample, ascending.
         depths: metres along the ray.
+        points: where they lie in the world, metres.
         directed: directed soft occupancy, without gradient.
         neighbours: nearest anchors.
     """
@@ -171,13 +174,14 @@ class VisibleSamples:
     weights: Float[Tensor, "kept"]
     rays: Int[Tensor, "kept"]
     depths: Float[Tensor, "kept"]
+    points: Float[Tensor, "kept 3"]
     directed: Float[Tensor, "kept bones"]
     neighbours: Neighbours
 
 
 @dataclass(frozen=True, eq=False)
 class _Weighed:
-    """:class:`VisibleSamples` before their anchors are looked for; ``points`` are in the world."""
+    """:class:`VisibleSamples` before their anchors are looked for."""
 
     weights: Float[Tensor, "kept"]
     rays: Int[Tensor, "kept"]
@@ -233,8 +237,10 @@ class HandAvatar(nn.Module):
     Attributes:
         edit: changes of the look that belong to the avatar: they are saved with it, and what
             rendering is asked for comes on top.
+        texture: detail that is finer than the anchors; None where none was learned.
     """
 
+    texture: DetailTexture | None
     coefficients: Tensor
     anchor_corners: Tensor
     anchor_barycentric: Tensor
@@ -279,6 +285,7 @@ class HandAvatar(nn.Module):
         self.illumination = IlluminationField(
             anchors.positions(self.rig.template_vertices), cues or PaperCues()
         )
+        self.texture = None
         self._replay: Replay[HandState] = Replay()
         if count := self.illumination.chosen.num_directions:
             self.illumination.directions.copy_(even_directions(count))
@@ -317,6 +324,34 @@ class HandAvatar(nn.Module):
         albedo = (color / START_LIGHT).clamp(0.05, 0.95)
         self.albedo.mlp.output.weight.mul_(0.1)
         self.albedo.mlp.output.bias.copy_(torch.logit(albedo))
+
+    def give_texture(self, size: int) -> DetailTexture:
+        """A texture for detail that is finer than the anchors; it changes nothing yet.
+
+        Args:
+            size: texels along a side.
+        """
+        chart = charted(self.base_rig.to("cpu"), self.rig.to("cpu"), self.rounds)
+        anchors = SurfacePoints(self.anchor_corners.cpu(), self.anchor_barycentric.cpu())
+        self.texture = DetailTexture(chart, anchors, size).to(self.device)
+        return self.texture
+
+    def detail_near(
+        self,
+        vertices: Float[Tensor, "vertices 3"],
+        points: Float[Tensor, "points 3"],
+        neighbours: Neighbours,
+    ) -> Float[Tensor, "points 3"] | None:
+        """The texture's residual of the albedo at points; None where there is no texture.
+
+        Args:
+            vertices: of the fine mesh, where the points are meant, metres.
+            points: near it, metres.
+            neighbours: nearest anchors of the points.
+        """
+        if self.texture is None:
+            return None
+        return self.texture(self.texture.places(vertices, points, neighbours))
 
     def personal(self, pose: HandPose) -> ShapedHand:
         """The personal rest hand of a pose (paper Sec. 3.1)."""
@@ -422,7 +457,9 @@ class HandAvatar(nn.Module):
         seen = self.visible_samples(state, rays, settings, generator)
         edit = self.edit.then(edit or Edit())
         normals = seen.neighbours.interpolated(state.anchor_normals)
-        albedo = edit.painted(edit.of_albedo(self.albedo(seen.neighbours)), seen.neighbours)
+        detail = self.detail_near(state.posed.vertices, seen.points, seen.neighbours)
+        albedo = self.albedo(seen.neighbours, detail)
+        albedo = edit.painted(edit.of_albedo(albedo), seen.neighbours)
         illumination = edit.of_illumination(
             self.illumination(
                 state.posed.pose.rotations,
@@ -457,7 +494,7 @@ class HandAvatar(nn.Module):
         """The samples that weigh something in their ray; see :meth:`render_rays`."""
         found = self._weighed(state.codes, rays, settings, generator)
         neighbours = nearest_anchors(state.anchors, found.points, kernel=settings.kernel)
-        return VisibleSamples(found.weights, found.rays, found.depths, found.directed, neighbours)
+        return VisibleSamples(**vars(found), neighbours=neighbours)
 
     def alpha(
         self,
@@ -852,6 +889,11 @@ class HandAvatar(nn.Module):
         self.occupancy.margin = about["margin"]
         self.occupancy.softness = about["softness"]
         self.occupancy.sharpness = about["sharpness"]
+        texels = state.get("texture.texels")
+        if texels is None:
+            self.texture = None
+        elif self.texture is None or self.texture.texels.shape != texels.shape:
+            self.give_texture(len(texels))
         self.load_state_dict(state)
         self.edit = _stored_edit(about["edit"], tensors)
 

@@ -82,7 +82,7 @@ def _shaded(
     weights = inverse_distance_weights(state.anchors, points, indices)
     neighbours = Neighbours(indices, weights)
     normals = (weights[..., None] * state.anchor_normals[indices]).sum(1)
-    albedo = avatar.albedo(neighbours)
+    albedo = avatar.albedo(neighbours, avatar.detail_near(state.posed.vertices, points, neighbours))
     traced = (weights[..., None] * state.light[indices]).sum(1)
     light = avatar.illumination(state.posed.pose.rotations, neighbours, directed, normals, traced)
     return torch.cat([albedo, light[:, None], normals], dim=-1)

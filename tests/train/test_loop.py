@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -213,6 +214,36 @@ def test_the_papers_method_takes_tracked_poses_as_they_are(tmp_path: Path) -> No
     assert method.outline_rounds == method.personal_steps == method.warm_steps == 0
     assert training.avatar.illumination.chosen.name == "paper"
     assert (method.frames * method.patches, method.patch_size, method.num_samples) == (16, 32, 64)
+
+
+def test_detail_is_learned_last_and_begun_anew_by_whoever_was_stopped_in_it(
+    tiny_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(METHODS, "quick", replace(TINY, detail_size=32, detail_steps=2))
+    whole = train(_options(tiny_capture, tmp_path / "whole", steps=4))
+    avatar = HandAvatar.load(whole)
+    assert avatar.texture is not None and bool(avatar.texture.texels.any())
+    assert avatar.info["detail"]["size"] == 32 and avatar.info["detail"]["steps"] == 2
+    assert 0 < avatar.info["detail"]["seen_share"] < 1
+
+    learn = loop.learn_detail
+
+    def stopped_early(*args: Any) -> Any:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return learn(*args)
+
+    monkeypatch.setattr(loop, "learn_detail", stopped_early)
+    with pytest.raises(Interrupted, match="detail"):
+        train(_options(tiny_capture, tmp_path / "stopped", steps=4))
+    assert not (tmp_path / "stopped" / "avatar.safetensors").exists()
+    monkeypatch.setattr(loop, "learn_detail", learn)
+    again = train(_options(tiny_capture, tmp_path / "stopped", steps=4))
+    assert (again / "avatar.safetensors").read_bytes() == (
+        whole / "avatar.safetensors"
+    ).read_bytes()
+    assert [
+        (METHODS[name].detail_size, METHODS[name].detail_steps) for name in ("joint", "paper")
+    ] == [(0, 0)] * 2
 
 
 # --- interruptions --------------------------------------------------------------------------------

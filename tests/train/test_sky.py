@@ -38,6 +38,7 @@ def _seen_under(sky: torch.Tensor, tones: torch.Tensor) -> SeenSamples:
         starts=torch.arange(6001),
         colors=value[:, None].expand(-1, 3).clamp(0, 1),
         alpha=torch.ones(6000),
+        points=torch.zeros(6000, 3),
         rotations=torch.zeros(1, 16, 3),
     )
 

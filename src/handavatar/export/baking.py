@@ -13,7 +13,6 @@ from handavatar.avatar import HandAvatar, RenderSettings
 from handavatar.capture.motion import middle_of_hand, placed
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
-from handavatar.export.chart import Texels, texels_of
 from handavatar.field.anchors import Neighbours, nearest_anchors
 from handavatar.geometry.cameras import Rays
 from handavatar.geometry.colors import eight_bits, linear_from_srgb
@@ -21,6 +20,7 @@ from handavatar.geometry.meshes import SurfacePoints
 from handavatar.geometry.rotations import invert_rigid, matrix_from_axis_angle
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
 from handavatar.hand.rig import ShapedHand
+from handavatar.render.chart import Texels, texels_of
 
 NUM_LIGHT_POSES = 20
 """Poses, and as many turns of the wrist, whose light is averaged: an anchor's mean over them is
@@ -68,24 +68,27 @@ def anchors_near(
 
 
 @torch.no_grad()
-def albedo_at(avatar: HandAvatar, neighbours: Neighbours, edit: Edit) -> Float[Tensor, "points 3"]:
-    """Albedo as pictures show it: sRGB in [0, 1], shifted and painted.
+def albedo_at(
+    avatar: HandAvatar,
+    neighbours: Neighbours,
+    edit: Edit,
+    detail: Float[Tensor, "points 3"] | None = None,
+) -> Float[Tensor, "points 3"]:
+    """Albedo as pictures show it: sRGB in [0, 1], with its detail, shifted and painted.
 
     Args:
         avatar: its own edit comes first.
         neighbours: nearest anchors of the points.
         edit: on top.
+        detail: of the avatar's texture at the points, where it has one.
     """
     edit = avatar.edit.then(edit)
-    parts = zip(
-        neighbours.indices.split(_POINTS_AT_ONCE),
-        neighbours.weights.split(_POINTS_AT_ONCE),
-        strict=True,
-    )
     found = []
-    for indices, weights in parts:
-        part = Neighbours(indices, weights)
-        found.append(edit.painted(edit.of_albedo(avatar.albedo(part)), part))
+    for start in range(0, max(len(neighbours.indices), 1), _POINTS_AT_ONCE):
+        window = slice(start, start + _POINTS_AT_ONCE)
+        part = Neighbours(neighbours.indices[window], neighbours.weights[window])
+        albedo = avatar.albedo(part, None if detail is None else detail[window])
+        found.append(edit.painted(edit.of_albedo(albedo), part))
     return torch.cat(found)
 
 
@@ -93,6 +96,14 @@ def points_of_texels(hand: ShapedHand, texels: Texels) -> Float[Tensor, "texels 
     """Where each texel lies on the hand in its zero pose, metres."""
     on_faces = SurfacePoints(hand.rig.faces[texels.faces], texels.barycentric)
     return on_faces.positions(hand.rest_vertices)
+
+
+def _detail_of_texels(avatar: HandAvatar, texels: Texels) -> Float[Tensor, "texels 3"] | None:
+    """What the avatar's texture, which is on the same chart, says of texels of another size."""
+    if avatar.texture is None:
+        return None
+    places = (torch.stack([texels.columns, texels.rows], dim=-1) + 0.5) / texels.size
+    return avatar.texture(places)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +143,7 @@ def baked_textures(
     """
     texels = texels_of(hand.rig, size)
     near = anchors_near(avatar, hand, points_of_texels(hand, texels))
-    colors = albedo_at(avatar, near, edit)
+    colors = albedo_at(avatar, near, edit, _detail_of_texels(avatar, texels))
     if not has_light_baked and not has_occlusion:
         return Textures(_png(texels.filled(colors)), b"", 0.0)
     light = mean_light(avatar, hand, edit, light_poses)
@@ -154,7 +165,8 @@ def colors_at_vertices(
 ) -> Float[Tensor, "vertices 3"]:
     """Colours of a hand's vertices; see :func:`baked_textures`."""
     near = anchors_near(avatar, hand, hand.rest_vertices)
-    colors = albedo_at(avatar, near, edit)
+    detail = avatar.detail_near(hand.rest_vertices, hand.rest_vertices, near)
+    colors = albedo_at(avatar, near, edit, detail)
     if not has_light_baked:
         return colors
     return colors * near.interpolated(mean_light(avatar, hand, edit, light_poses).anchors[:, None])

@@ -180,7 +180,8 @@ def lightweight_hand(
         )
     )
     with torch.no_grad():
-        albedo = avatar.albedo(near)
+        points = hand.rig.sealed(hand.rest_vertices)
+        albedo = avatar.albedo(near, avatar.detail_near(hand.rest_vertices, points, near))
     loss = measured_loss(network, held_out, around_held_out, levels, albedo, correctives, hand)
     paint = avatar.edit.then(edit).paint
     coat = None

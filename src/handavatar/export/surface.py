@@ -7,11 +7,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar
-from handavatar.export.chart import charted
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import sample_poses
 from handavatar.hand.rig import Rig, ShapedHand
 from handavatar.hand.skin_refinement import strongest_bones
+from handavatar.render.chart import charted
 
 NUM_SHAPE_POSES = 64
 """Poses whose personal rest shapes are averaged."""

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from handavatar.field.anchors import Neighbours
 from handavatar.field.layers import MLP, positional_encoding
+from handavatar.field.texture import detailed
 
 NUM_FREQUENCIES = 3
 CODE_WIDTH = 128
@@ -39,9 +40,17 @@ class AlbedoField(nn.Module):
         self.codes = nn.Parameter(CODE_SPREAD * torch.randn(num_anchors, CODE_WIDTH))
         self.mlp = MLP(CODE_WIDTH, 256, 4, 3)
 
-    def forward(self, neighbours: Neighbours) -> Float[Tensor, "queries 3"]:
-        """RGB in [0, 1]."""
-        return self.mlp(neighbours.interpolated(self.codes)).sigmoid()
+    def forward(
+        self, neighbours: Neighbours, residual: Float[Tensor, "queries 3"] | None = None
+    ) -> Float[Tensor, "queries 3"]:
+        """RGB in [0, 1].
+
+        Args:
+            neighbours: nearest anchors of the queries.
+            residual: of :class:`handavatar.field.texture.DetailTexture`, where there is one.
+        """
+        albedo = self.mlp(neighbours.interpolated(self.codes)).sigmoid()
+        return albedo if residual is None else detailed(albedo, residual)
 
 
 @dataclass(frozen=True, eq=False)

@@ -355,6 +355,8 @@ def _samples_along(
     found = avatar.visible_samples(state, rays, settings)
     ones = torch.ones_like(found.weights)[:, None]
     counts = torch.bincount(found.rays, minlength=len(rays.origins))
+    places = composite_sparse(found.weights, found.rays, found.points, len(rays.origins))
+    alpha = composite_sparse(found.weights, found.rays, ones, len(rays.origins))
     seen = SeenSamples(
         weights=found.weights,
         directed=found.directed,
@@ -364,7 +366,8 @@ def _samples_along(
         frames=torch.zeros_like(found.rays),
         starts=torch.cat([counts.new_zeros(1), counts.cumsum(0)]),
         colors=found.weights.new_zeros(len(rays.origins), 3),
-        alpha=composite_sparse(found.weights, found.rays, ones, len(rays.origins))[:, 0],
+        alpha=alpha[:, 0],
+        points=places / alpha.clamp_min(1e-6),
         rotations=state.posed.pose.rotations[None],
     )
     return _Along(seen, found.depths)

@@ -33,6 +33,7 @@ class SeenSamples:
         starts: where each pixel's samples begin; its samples are neighbours in all of the above.
         colors: true colour of each pixel, in [0, 1], at the capture's average exposure.
         alpha: how much of each pixel the hand covers.
+        points: mean place of each pixel's samples, metres, world.
         rotations: pose of each frame, axis-angle.
     """
 
@@ -45,6 +46,7 @@ class SeenSamples:
     starts: Int[Tensor, "pixels_and_one"]
     colors: Float[Tensor, "pixels 3"]
     alpha: Float[Tensor, "pixels"]
+    points: Float[Tensor, "pixels 3"]
     rotations: Float[Tensor, "frames bones 3"]
 
 
@@ -58,7 +60,7 @@ def find_seen_samples(
     those of which nothing is known.
     """
     weights, directed, indices, shares, normals, lights = [], [], [], [], [], []
-    numbers, counts, colors, alphas = [], [], [], []
+    numbers, counts, colors, alphas, points = [], [], [], [], []
     for number, frame in enumerate(frames):
         state = avatar.prepare(frame.pose.to(avatar.device))
         camera = frame.camera.to(avatar.device)
@@ -82,6 +84,8 @@ def find_seen_samples(
         counts.append(torch.bincount(seen.rays, minlength=len(x))[is_covered])
         colors.append(frame.colors[y, x].to(alpha)[is_covered])
         alphas.append(alpha[is_covered])
+        mean = composite_sparse(seen.weights, seen.rays, seen.points, len(x)) / alpha[:, None]
+        points.append(mean[is_covered])
     starts = torch.cat(counts).cumsum(0)
     return SeenSamples(
         torch.cat(weights),
@@ -93,6 +97,7 @@ def find_seen_samples(
         torch.cat([torch.zeros_like(starts[:1]), starts]),
         torch.cat(colors),
         torch.cat(alphas),
+        torch.cat(points),
         torch.stack([frame.pose.rotations for frame in frames]).to(avatar.device),
     )
 

@@ -1,7 +1,7 @@
 """The training loop: capture in, avatar out. There is only this one."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar, RenderSetting
 from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
 from handavatar.capture.view import view_of
 from handavatar.evaluate.metrics import mean_color
-from handavatar.evaluate.perceptual import PerceptualLoss, perceptual_loss
+from handavatar.evaluate.perceptual import PerceptualChoice, PerceptualLoss, perceptual_loss
 from handavatar.field.shading import CueSet, OrientedCues, PaperCues, TracedCues
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside
@@ -28,6 +28,7 @@ from handavatar.train.appearance import (
 )
 from handavatar.train.border import border_pixels, fit_border
 from handavatar.train.corrections import PoseCorrections
+from handavatar.train.detail import learn_detail
 from handavatar.train.labelled_poses import sample_points
 from handavatar.train.live import shown_live
 from handavatar.train.losses import border_loss, color_loss, occupancy_loss
@@ -107,6 +108,9 @@ class Method:
         occupancy_every: L_PairOF is taken at every so many steps.
         rounds: midpoint subdivisions of the rig's mesh.
         num_anchors: anchors on the surface.
+        detail_size: texels along a side of the texture that is learned last (``train.detail``); 0
+            is none.
+        detail_steps: that it is learned for, after it was unwrapped.
     """
 
     steps: int
@@ -139,7 +143,12 @@ class Method:
     occupancy_every: int = 1
     rounds: int = 2
     num_anchors: int = 4096
+    detail_size: int = 0
+    detail_steps: int = 0
 
+
+_DETAIL_STRIDE = 4
+"""Where no pixels were found before, every so-manieth tells the detail of the light."""
 
 _QUICK = Method(
     steps=320,
@@ -164,12 +173,22 @@ _QUICK = Method(
     lr_pose=5e-3,
     decay=0.02,
     occupancy_every=4,
+    detail_size=1024,
+    detail_steps=200,
 )
 METHODS: dict[str, Method] = {
     "quick": _QUICK,
     "best": replace(_QUICK, cues=TracedCues()),
     # Its rates for the geometry are those of the last steps of all; these are the paper's.
-    "joint": replace(_QUICK, warm_steps=0, lr_shape=5e-4, lr_decoder=5e-5, lr_pose=1e-3),
+    "joint": replace(
+        _QUICK,
+        warm_steps=0,
+        lr_shape=5e-4,
+        lr_decoder=5e-5,
+        lr_pose=1e-3,
+        detail_size=0,
+        detail_steps=0,
+    ),
     "paper": Method(
         steps=50_000,
         frames=8,
@@ -197,8 +216,9 @@ class TrainOptions:
         resume: ``auto`` continues the newest run of this capture and method (or the one at
             ``out``) if there is one; ``never`` starts anew.
         prior: occupancy prior to start from.
-        perceptual: ``auto`` takes LPIPS where its weights are present, else the substitute; the
-            run records which.
+        perceptual: ``auto`` takes LPIPS where its weights are present, else the features of a
+            network that the extra ``perceptual`` installs, else the substitute; the run records
+            which.
         checkpoint_every: steps between checkpoints.
         seed: of everything.
         device: ``auto`` takes a GPU if there is one.
@@ -210,7 +230,7 @@ class TrainOptions:
     steps: int | None = None
     resume: Literal["auto", "never"] = "auto"
     prior: Path = SHIPPED_PRIOR
-    perceptual: Literal["auto", "lpips", "substitute"] = "auto"
+    perceptual: PerceptualChoice = "auto"
     checkpoint_every: int = 100
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -290,8 +310,49 @@ def train(options: TrainOptions) -> Path:
                     _save(run, training, outlines, step)
                 if stopped() and not is_last:
                     raise Interrupted(f"stopped at step {step}; continue with --resume auto")
+        _learn_detail(training, frames, seen, perceptual, method, options.seed, stopped)
         training.avatar.save(run.avatar)
     return run.folder
+
+
+def _learn_detail(
+    training: Training,
+    frames: list[Frame],
+    seen: SeenSamples | None,
+    perceptual: PerceptualLoss,
+    method: Method,
+    seed: int,
+    stopped: Callable[[], bool],
+) -> None:
+    """The texture, from the last checkpoint on: whoever is stopped here begins it anew."""
+    if not method.detail_size:
+        return
+    avatar, corrected = training.avatar, corrected_frames(training, frames)
+    if seen is None:
+        settings = RenderSettings(num_samples=method.num_samples)
+        seen = find_seen_samples(avatar, corrected, settings, _DETAIL_STRIDE)
+
+    def end_if_stopped() -> None:
+        if stopped():
+            raise Interrupted("stopped while the detail is learned; continue with --resume auto")
+
+    learned = learn_detail(
+        avatar,
+        corrected,
+        seen,
+        method.detail_size,
+        method.detail_steps,
+        perceptual,
+        method.perceptual_weight,
+        seed,
+        end_if_stopped,
+    )
+    avatar.info["detail"] = {
+        "size": method.detail_size,
+        "steps": method.detail_steps,
+        "perceptual": perceptual.name,
+        "seen_share": round(learned.seen_share, 4),
+    }
 
 
 @contextmanager

@@ -84,7 +84,8 @@ class BakedAvatar:
             self._at_lit = nearest_anchors(places, lit)
             self._from_lit = nearest_anchors(lit, template)
             self._from_probes = nearest_anchors(lit[::every], lit)
-            self._albedo = avatar.albedo(self._at_vertices)
+            detail = avatar.detail_near(template, template, self._at_vertices)
+            self._albedo = avatar.albedo(self._at_vertices, detail)
         base = avatar.base_rig
         self._levels = subdivision_levels(base.faces, base.num_vertices, avatar.rounds)
         self._poses: OrderedDict[bytes, BakedPose] = OrderedDict()

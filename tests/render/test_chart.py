@@ -6,11 +6,11 @@ import pytest
 import torch
 from mano_files import write_mano
 
-from handavatar.export.chart import charted, is_fair, packed_atlas, texels_of
 from handavatar.export.surface import split_at_seams
 from handavatar.hand.detail import subdivided
 from handavatar.hand.mano import read_mano
 from handavatar.hand.rig import Rig
+from handavatar.render.chart import charted, is_fair, packed_atlas, texels_of
 
 
 @pytest.fixture(scope="module")
