@@ -132,6 +132,11 @@ class Descent:
         """Of each frame, priors included."""
         return self._linearised(look, self.poses, self.shared).energies
 
+    def judge(self, look: Look) -> tuple[Float[Tensor, "frames"], Float[Tensor, "frames 51 51"]]:
+        """:meth:`energies` and :meth:`covariances` at once."""
+        here = self._linearised(look, self.poses, self.shared)
+        return here.energies, torch.linalg.inv(here.pose_blocks().double()).float()
+
     def covariances(self, look: Look) -> Float[Tensor, "frames 51 51"]:
         """Of each pose's errors, as the curvature of its energy says; neighbours held still."""
         here = self._linearised(look, self.poses, self.shared)
