@@ -1,0 +1,153 @@
+"""The descent: no step raises a frame's energy, and the shape takes its share of the blame."""
+
+import pytest
+import torch
+from made_frames import (
+    NO_POINTS,
+    calm_poses,
+    camera_over,
+    moved_by,
+    observe_all,
+    points_on,
+    spoilt,
+)
+
+from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
+from handavatar.fit.kinematics import NUM_UNKNOWNS
+from handavatar.fit.shape import ShapeSpace, fixed_shape
+from handavatar.fit.solver import Descent, Look
+from handavatar.hand.pose import HandPose
+from handavatar.hand.rig import Rig, ShapedHand
+
+SIZE, FRAMES = 96, 4
+
+
+def _descent(
+    hand: ShapedHand,
+    observations: list[Observation],
+    tracked: HandPose,
+    degrees: float,
+    space: ShapeSpace | None = None,
+    is_sequence: bool = False,
+) -> Descent:
+    space = space or fixed_shape(hand.rig)
+    surface = points_on(hand, count=600).surface
+    sigma = torch.full((NUM_UNKNOWNS,), degrees / 57.3 / 3**0.5)
+    sigma[-3:] = 0.5e-3 * degrees
+
+    def points_of(shared: torch.Tensor, frame: int) -> HandPoints:
+        return HandPoints(space.shaped(hand, shared), space, surface, NO_POINTS)
+
+    return Descent(
+        observations=observations,
+        times=torch.tensor([seen.time for seen in observations]),
+        tracked=tracked,
+        information=torch.diag(sigma**-2).expand(len(observations), -1, -1),
+        points_of=points_of,
+        shared_sigmas=space.sigmas,
+        options=EnergyOptions(),
+        is_sequence=is_sequence,
+        poses=tracked,
+        shared=torch.zeros(len(space.sigmas)),
+    )
+
+
+@pytest.fixture(scope="module")
+def truth(rig: Rig) -> HandPose:
+    return calm_poses(rig, FRAMES)
+
+
+@pytest.fixture(scope="module")
+def frames(rig: Rig, truth: HandPose) -> list[Observation]:
+    return observe_all(rig.shaped(), truth, camera_over(SIZE))
+
+
+def test_no_step_raises_a_frames_energy(
+    rig: Rig, truth: HandPose, frames: list[Observation]
+) -> None:
+    tracked = spoilt(truth, 6.0)
+    descent = _descent(rig.shaped(), frames, tracked, 6.0)
+    look = Look(0.7, 3.0)
+    before = first = descent.energies(look)
+    for _ in range(5):
+        descent.step_poses(look, 1)
+        after = descent.energies(look)
+        # Energies of some hundreds, summed in float32 in the same order.
+        assert bool((after <= before).all())
+        before = after
+    assert bool((before < 0.7 * first).all())
+    near = moved_by(rig.shaped(), descent.poses, truth)
+    assert float(near.mean()) < 0.8 * float(moved_by(rig.shaped(), tracked, truth).mean())
+
+
+def test_no_step_raises_the_energy_of_a_sequence(
+    rig: Rig, truth: HandPose, frames: list[Observation]
+) -> None:
+    # Frames that differ much: motion speaks loudly, and neighbours pull at each other.
+    descent = _descent(rig.shaped(), frames, spoilt(truth, 6.0), 6.0, is_sequence=True)
+    look = Look(0.7, 3.0)
+    before = first = float(descent.energies(look).sum())
+    for _ in range(5):
+        descent.step_poses(look, 1)
+        after = float(descent.energies(look).sum())
+        assert after <= before * (1 + 1e-6)
+        before = after
+    assert before < first
+
+
+def test_selected_frames_descend_as_among_others(
+    rig: Rig, truth: HandPose, frames: list[Observation]
+) -> None:
+    descent = _descent(rig.shaped(), frames, spoilt(truth, 6.0), 6.0)
+    look = Look(0.7, 3.0)
+    part = descent.select(torch.tensor([2, 0]))
+    assert torch.equal(part.energies(look), descent.energies(look)[[2, 0]])
+    descent.step_poses(look, 2)
+    part.step_poses(look, 2)
+    torch.testing.assert_close(
+        part.poses.rotations, descent.poses.rotations[[2, 0]], rtol=0, atol=1e-6
+    )
+
+
+def test_covariances_shrink_where_something_is_seen(
+    rig: Rig, truth: HandPose, frames: list[Observation]
+) -> None:
+    descent = _descent(rig.shaped(), frames, truth, 5.0)
+    prior = torch.linalg.inv(descent.information[0])
+    for covariance in descent.covariances(Look(0.7, 1.5)):
+        torch.testing.assert_close(covariance, covariance.T, rtol=1e-3, atol=1e-9)
+        assert float(torch.linalg.eigvalsh(covariance.double())[0]) > 0
+        # Nothing is surer of its opposite, and the outline tells where the hand lies.
+        assert bool((covariance.diagonal() <= 1.001 * prior.diagonal()).all())
+        assert float(covariance.diagonal()[-3:].min()) < 0.2 * float(prior[-1, -1])
+    # Without outlines and colours, in frames for themselves, there is what was told alone,
+    # and what joints mostly do.
+    torch.testing.assert_close(descent.tracked_information(), descent.information)
+
+
+def test_a_changed_shape_is_found_from_outlines(rig: Rig, truth: HandPose) -> None:
+    """Coefficients of 0.8 standard deviations, of which half or more is found at once."""
+    space = ShapeSpace.around(rig, 1.0, 2)
+    change = torch.zeros(len(space.sigmas))
+    change[0] = 0.8
+    true_hand = space.shaped(rig.shaped(), change)
+    seen = observe_all(true_hand, truth, camera_over(SIZE))
+    descent = _descent(rig.shaped(), seen, truth, 1.0, space)
+    look = Look(0.7, 3.0)
+    before = float(descent.energies(look).sum())
+    descent.step_shape(look, 8)
+    found = descent.shared
+    print(found, before, float(descent.energies(look).sum()))
+    assert float(descent.energies(look).sum()) < 0.3 * before
+    assert 0.6 < float(found[0]) < 1.0
+    left = (space.shaped(rig.shaped(), found).rest_vertices - true_hand.rest_vertices).norm(dim=-1)
+    blame = (rig.template_vertices - true_hand.rest_vertices).norm(dim=-1)
+    assert float(left.mean()) < 0.4 * float(blame.mean())
+
+
+def test_a_true_shape_stays(rig: Rig, truth: HandPose, frames: list[Observation]) -> None:
+    space = ShapeSpace.around(rig, 0.5, 2)
+    descent = _descent(rig.shaped(), frames, truth, 1.0, space)
+    descent.step_shape(Look(0.7, 1.5), 6)
+    assert float(descent.shared.abs().max()) < 0.25
+    assert float(moved_by(rig.shaped(), descent.poses, truth).max()) < 0.6
