@@ -5,9 +5,11 @@ from frame to frame; in ``noise5t`` the same noise lasts for a while. In ``video
 way that a person's own video goes: tracked, masked, fitted. Rows are the stages of that way:
 
 * ``tracked``: poses as given; of a film, the fit to the tracker's landmarks alone.
-* ``fitted``: of a film, what ``capture video`` makes of it.
-* ``outlines``: after ``train.outlines``, as the method ``quick`` begins.
-* ``registered``: after ``handavatar.fit.register``, where there is one.
+* ``fitted``: of a film, the landmarks and then the outlines of the first masks, by the weights
+  that ``capture video`` had before there was :mod:`handavatar.fit`.
+* ``outlines``: from there on to ``train.outlines``, as the method ``quick`` began before it.
+* ``registered``: by :mod:`handavatar.fit`: of a film, what ``capture video`` makes of it; of a
+  capture with noise, what training begins with.
 
 All rows of a case are judged on the same frames: those of the training split of a capture; of a
 film those that ``capture video`` keeps. In the cases with noise both hands have the true shape
@@ -15,8 +17,6 @@ coefficients, so that poses alone count. A film is brought to the true depth fir
 :func:`~handavatar.bench.measures.brought_to_depth`.
 """
 
-import importlib
-import importlib.util
 import json
 import re
 import tempfile
@@ -49,8 +49,11 @@ from handavatar.capture.decoding import video_frames
 from handavatar.capture.default import default_capture
 from handavatar.capture.degraded import DegradeOptions, degrade_capture
 from handavatar.capture.fitted_hand import HandFit
-from handavatar.capture.fitting import fit_hands
+from handavatar.capture.fitting import Observations, fit_hands
 from handavatar.capture.frames import Capture, Frame, read_capture
+from handavatar.capture.masks import find_mask, learn_colors
+from handavatar.capture.outlines import OutlineMatcher, mask_outline
+from handavatar.capture.registration import register_capture
 from handavatar.capture.tracking import Track, track_hand
 from handavatar.capture.video import VideoOptions, capture_video, observations_of
 from handavatar.evaluate.intervals import mean_interval
@@ -68,7 +71,6 @@ ROWS = ("tracked", "fitted", "outlines", "registered")
 CORRELATION = 0.5
 """Seconds: of the noise in cases whose name ends in ``t``."""
 _NOISE_CASE = re.compile(r"noise(\d+(?:\.\d+)?)(t?)")
-_REGISTRATION = "handavatar.fit.register"
 
 
 @dataclass(frozen=True)
@@ -259,9 +261,7 @@ def _noisy_row(row: str, source: Capture, spoilt: Capture) -> ClipScores | None:
     elif row == "outlines":
         poses = outlined_poses(spoilt, frames)
     elif row == "registered":
-        registered = _registered_poses(spoilt)
-        if registered is None:
-            return None
+        registered = register_capture(spoilt)
         poses = [registered[index] for index in indices]
     else:
         return None
@@ -378,18 +378,25 @@ class FilmRoad:
 
     def scores(self, row: str) -> ClipScores | None:
         """One row; None where it does not apply."""
-        fitted = self.found(self.capture())
-        if row == "tracked":
-            fit = fit_hands(self.truth.rig, observations_of(self.track()), self.options.fit)
-            return judge_film(self.truth, self._of_landmarks(fitted, fit), self._tried())
-        if row == "fitted":
-            return judge_film(self.truth, fitted, self._tried())
+        registered = self.found(self.capture())
+        if row == "registered":
+            return judge_film(self.truth, registered, self._tried())
+        rig, seen = self.truth.rig, observations_of(self.track())
+        matcher = None if row == "tracked" else self._matcher(seen)
+        found = self._of_fit(registered, fit_hands(rig, seen, self.options.fit, matcher))
         if row == "outlines":
-            return judge_film(self.truth, self._outlined(fitted), self._tried())
-        registered = _registered_video(self.path, self.track(), self.folder / "registered")
-        if registered is None:
-            return None
-        return judge_film(self.truth, self.found(registered), self._tried())
+            found = self._outlined(found)
+        return judge_film(self.truth, found, self._tried())
+
+    def _matcher(self, seen: Observations) -> OutlineMatcher:
+        """Outlines of the first masks, as the fit before this one was drawn to them."""
+        hands = self.track().hands
+        colors = learn_colors(hands)
+        outlines = [
+            mask_outline(find_mask(hand, colors).pixels, hand.window, float(scale))
+            for hand, scale in zip(hands, seen.scale, strict=True)
+        ]
+        return OutlineMatcher(self.truth.rig, outlines, self.track().picture_size)
 
     def _tried(self) -> int:
         """Pictures that were looked at."""
@@ -410,8 +417,8 @@ class FilmRoad:
             masks=[frame.mask.numpy() for frame in frames],
         )
 
-    def _of_landmarks(self, fitted: FoundClip, fit: HandFit) -> FoundClip:
-        """The poses of a fit to landmarks alone, in the crops of the capture."""
+    def _of_fit(self, fitted: FoundClip, fit: HandFit) -> FoundClip:
+        """The poses of another fit, in the crops of the capture."""
         number = {hand.index: place for place, hand in enumerate(self.track().hands)}
         zoom = fit.focal / fitted.focal
         return replace(
@@ -429,7 +436,7 @@ class FilmRoad:
         if not kept:
             return fitted
         poses = list(fitted.poses)
-        frames = [capture.frame(index) for index in kept]
+        frames = [replace(capture.frame(index), pose=poses[index]) for index in kept]
         for index, pose in zip(kept, outlined_poses(capture, frames), strict=True):
             poses[index] = pose
         return replace(fitted, poses=poses)
@@ -543,21 +550,6 @@ def outlined_poses(capture: Capture, frames: list[Frame]) -> list[HandPose]:
             corrected_pose(training.corrections, frame, number, device)
             for number, frame in enumerate(frames)
         ]
-
-
-def _registered_poses(capture: Capture) -> list[HandPose] | None:
-    """Poses of all frames of a tracked capture after registration; None where there is none yet."""
-    if importlib.util.find_spec(_REGISTRATION.rpartition(".")[0]) is None:
-        return None
-    return list(importlib.import_module(_REGISTRATION).register_capture(capture))
-
-
-def _registered_video(film: Path, track: Track, folder: Path) -> Capture | None:
-    """A capture of a film that registration has made; None where there is none yet."""
-    if importlib.util.find_spec(_REGISTRATION.rpartition(".")[0]) is None:
-        return None
-    register = importlib.import_module(_REGISTRATION).register_video
-    return read_capture(register(film, track, folder))
 
 
 def _hand_figures(

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from handavatar.capture.fitted_hand import HandFit
 from handavatar.capture.fitting import Observations
+from handavatar.capture.frames import Capture, Frame
 from handavatar.capture.masks import HandMask
 from handavatar.capture.tracking import TrackedHand
 from handavatar.capture.windows import window_camera
@@ -21,7 +22,8 @@ from handavatar.fit.pictures import FramePicture
 from handavatar.fit.register import Registered, RegisterOptions, register
 from handavatar.geometry.cameras import Camera
 from handavatar.hand.pose import NUM_BONES, HandPose
-from handavatar.hand.rig import Rig
+from handavatar.hand.rig import Rig, ShapedHand
+from handavatar.hand.rigs import find_rig
 
 LANDMARK_ERROR = 0.004
 """Metres by which a landmark is off, beside what the tracker itself admits."""
@@ -124,3 +126,71 @@ def register_hands(
 def posed_vertices(found: Registered) -> Float[Tensor, "frames vertices 3"]:
     """The registered mesh in every frame, with its own shape: metres, camera axes."""
     return found.hand.posed(found.poses).vertices
+
+
+def register_capture(capture: Capture, options: RegisterOptions | None = None) -> list[HandPose]:
+    """Poses of all frames of a tracked capture, drawn to what the frames show.
+
+    Args:
+        capture: with poses to begin with.
+        options: expected errors, rounds.
+
+    Raises:
+        RigError: if the rig that the poses belong to is not here.
+        CaptureError: if a frame is damaged.
+    """
+    rig = find_rig(capture.rig_sha256, capture.rig_name)
+    frames = [capture.frame(index) for index in range(len(capture.records))]
+    hand = rig.shaped(capture.shape_coefficients)
+    found = register_frames([hand], frames, options or RegisterOptions())
+    return poses_of(found)
+
+
+def register_frames(
+    hands: Sequence[ShapedHand],
+    frames: Sequence[Frame],
+    options: RegisterOptions,
+    learns_shape: bool = True,
+    progress: Callable[[float], None] | None = None,
+) -> Registered:
+    """Lays hands onto frames, held by what the capture says of its poses' errors.
+
+    Where it says nothing, one error of all joints is learned from how far the poses had to move.
+
+    Args:
+        hands: rest hand to begin with, one for all frames or one for each.
+        frames: with their poses as tracked.
+        options: expected errors, rounds.
+        learns_shape: whether the hand's shape moves.
+        progress: told how far it is.
+    """
+    covariances = [frame.covariance for frame in frames if frame.covariance is not None]
+    information = None
+    if len(covariances) == len(frames):
+        information = torch.linalg.inv(torch.stack(covariances).double()).float()
+    tracked = HandPose(
+        torch.stack([frame.pose.rotations for frame in frames]),
+        torch.stack([frame.pose.translation for frame in frames]),
+    )
+    return register(
+        hands,
+        [_observe(frame) for frame in frames],
+        tracked,
+        information,
+        options,
+        learns_shape=learns_shape,
+        progress=progress,
+    )
+
+
+def poses_of(found: Registered) -> list[HandPose]:
+    """The poses found, frame by frame."""
+    pairs = zip(found.poses.rotations, found.poses.translation, strict=True)
+    return [HandPose(rotations, translation) for rotations, translation in pairs]
+
+
+def _observe(frame: Frame) -> Observation:
+    picture = FramePicture.of(
+        frame.camera, frame.image.float() / 255, frame.alpha, frame.known, frame.gain
+    )
+    return Observation(picture, frame.time)

@@ -35,7 +35,7 @@ def textured_mesh_psnr(
     color: Float[Tensor, "3"],
     frames: Sequence[Frame],
     poses: Sequence[HandPose],
-    pose_of: Callable[[Frame], HandPose],
+    poses_of: Callable[[list[Frame]], list[HandPose]],
 ) -> float:
     """Masked PSNR of a textured mesh of the avatar's shape, fitted to the training frames.
 
@@ -45,7 +45,7 @@ def textured_mesh_psnr(
         color: :func:`training_color`.
         frames: to be judged.
         poses: of these.
-        pose_of: the pose of a training frame.
+        poses_of: the poses of training frames.
 
     Returns:
         Decibels, mean over the frames.
@@ -54,7 +54,8 @@ def textured_mesh_psnr(
     count = min(MESH_FRAMES, len(indices))
     places = torch.linspace(0, len(indices) - 1, count).round().long().tolist()
     training = [capture.frame(indices[place]) for place in places]
-    training = [replace(frame, pose=pose_of(frame)) for frame in training]
+    found = zip(training, poses_of(training), strict=True)
+    training = [replace(frame, pose=pose) for frame, pose in found]
     picture_of = fit_textured_mesh(avatar, training, color, MESH_STEPS, seed=0, rays=1)
     ratios = []
     for frame, pose in zip(frames, poses, strict=True):

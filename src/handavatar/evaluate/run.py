@@ -12,10 +12,11 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from handavatar.alignment import aligned_pose
 from handavatar.animate import VideoWriter
 from handavatar.avatar import HandAvatar, Rendering, chosen_device
 from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
+from handavatar.capture.registration import poses_of as registered_poses
+from handavatar.capture.registration import register_frames
 from handavatar.evaluate.baselines import judged_frame, textured_mesh_psnr, training_color
 from handavatar.evaluate.figures import protocol_figures
 from handavatar.evaluate.metrics import (
@@ -37,9 +38,10 @@ from handavatar.evaluate.report import (
     picture,
     write_report,
 )
+from handavatar.fit.register import RegisterOptions
 from handavatar.hand.pose import HandPose
+from handavatar.hand.rig import ShapedHand
 from handavatar.jobs.files import FolderKind, claim_folder
-from handavatar.render.rasterize import covered_pixels
 
 
 def _is_older_evaluation(folder: Path) -> bool:
@@ -123,7 +125,7 @@ def _protocols(avatar: HandAvatar, frames: list[Frame], is_tracked: bool) -> dic
     """By name; the first one is that of the figures outside of ``protocols``."""
     if not is_tracked:
         return {"known": _rendered(avatar, frames, [frame.pose for frame in frames])}
-    fitted = _rendered(avatar, frames, [held_out_pose(avatar, frame) for frame in frames])
+    fitted = _rendered(avatar, frames, held_out_poses(avatar, frames))
     poses = [
         registered_pose(avatar, frame, pose, rendering)
         for frame, pose, rendering in zip(frames, fitted.poses, fitted.renderings, strict=True)
@@ -143,18 +145,24 @@ def _rendered(avatar: HandAvatar, frames: list[Frame], poses: list[HandPose]) ->
     return _Protocol(poses, renderings, judged)
 
 
-def held_out_pose(avatar: HandAvatar, frame: Frame) -> HandPose:
-    """Training corrects the poses of its own frames; held-out frames get the same chance.
+def held_out_poses(avatar: HandAvatar, frames: list[Frame]) -> list[HandPose]:
+    """Poses by landmarks and masks alone, never by colours.
 
-    Where nothing is known, the outline is taken to be that of the tracked pose.
+    Training corrects the poses of its own frames; held-out frames get the same chance, with the
+    avatar's shape as it is.
     """
-    device = avatar.device
-    pose, camera, coverage = frame.pose.to(device), frame.camera.to(device), frame.alpha
-    if not bool(frame.known.all()):
-        posed = avatar.coarse_personal(pose).posed(pose)
-        covered = covered_pixels(posed.vertices, posed.rig.faces, camera).cpu()
-        coverage = torch.where(frame.known, coverage, covered.float())
-    return aligned_pose(avatar.coarse_personal, pose, camera, coverage)
+    hands = []
+    for frame in frames:
+        hand = avatar.coarse_personal(frame.pose.to(avatar.device))
+        rig = hand.rig.to("cpu") if avatar.device.type != "cpu" else hand.rig
+        hands.append(ShapedHand(rig, hand.rest_vertices.cpu(), hand.rest_joints.cpu()))
+    options = RegisterOptions(
+        pose_error=float(avatar.info.get("pose_error", RegisterOptions.pose_error)),
+        learns_pose_error=False,
+        color_sigmas=(),
+    )
+    found = register_frames(hands, frames, options, learns_shape=False)
+    return [pose.to(avatar.device) for pose in registered_poses(found)]
 
 
 def _opened(options: EvaluateOptions) -> tuple[HandAvatar, Capture, Path]:
@@ -268,13 +276,15 @@ def _baseline(
         for frame, flat, rendering in zip(main.judged, colors, main.renderings, strict=True)
     ]
 
-    def pose_of(frame: Frame) -> HandPose:
-        return held_out_pose(avatar, frame) if capture.is_tracked else frame.pose
+    def poses_of(training: list[Frame]) -> list[HandPose]:
+        if capture.is_tracked:
+            return held_out_poses(avatar, training)
+        return [frame.pose for frame in training]
 
     figures = (
         mean_color_masked_psnr(colors, main.judged),
         sum(map(masked_psnr, own)) / len(own),
-        textured_mesh_psnr(avatar, capture, color, frames, main.poses, pose_of),
+        textured_mesh_psnr(avatar, capture, color, frames, main.poses, poses_of),
     )
     return dict(zip(_BASELINES, figures, strict=True))
 

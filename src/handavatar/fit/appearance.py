@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from handavatar.fit.pictures import BlurredPicture, FramePicture
+from handavatar.fit.pictures import BlurredPicture, FramePicture, drawing_camera
 from handavatar.geometry.cameras import Camera, project
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
 from handavatar.hand.rig import Rig
@@ -63,10 +63,12 @@ def see_points(
     positions = points.positions(vertices)
     normals = normalize(points.positions(vertex_normals(vertices, rig.faces)), dim=-1)
     pixels, depth = project(camera, positions)
-    drawn = rasterize(rig.sealed(vertices), rig.sealed_faces, camera)
-    column, row = pixels.floor().long().unbind(-1)
-    is_inside = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    nearest = drawn.depth[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
+    small = drawing_camera(camera)
+    drawn = rasterize(rig.sealed(vertices), rig.sealed_faces, small)
+    places = pixels * pixels.new_tensor([small.width / camera.width, small.height / camera.height])
+    column, row = places.floor().long().unbind(-1)
+    is_inside = (column >= 0) & (row >= 0) & (column < small.width) & (row < small.height)
+    nearest = drawn.depth[row.clamp(0, small.height - 1), column.clamp(0, small.width - 1)]
     rotation, shift = camera.camera_from_world[:3, :3], camera.camera_from_world[:3, 3]
     facing = (normals * normalize(-(shift @ rotation) - positions, dim=-1)).sum(-1)
     is_visible = is_inside & (depth < nearest + _NEAR) & (facing > _LEAST_FACING)

@@ -22,7 +22,7 @@ from handavatar.fit.kinematics import (
     pixel_jacobian,
     rest_with_pose,
 )
-from handavatar.fit.pictures import BlurredPicture, FramePicture
+from handavatar.fit.pictures import BlurredPicture, FramePicture, drawing_camera
 from handavatar.fit.shape import ShapeSpace
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
@@ -224,7 +224,7 @@ def _add_outlines(
     camera = picture.camera
     unit = camera.width / 256 * options.outline_error
     far = outlier / options.outline_error
-    outline = outline_points(vertices, hand.rig.faces, camera)
+    outline = outline_points(vertices, hand.rig.faces, drawing_camera(camera))
     if len(outline.ends) == 0:
         return
     rest = _outline_rest(points, hand, outline)

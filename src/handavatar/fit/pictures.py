@@ -13,6 +13,8 @@ from handavatar.geometry.cameras import Camera
 from handavatar.render.silhouette import known_distance
 
 _MOST_BORDER_POINTS = 240
+_DRAWN_SIDE = 144
+"""Pixels: 1 to 2 mm each on a hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +131,17 @@ def _border_of(
     points = points[:: max(1, len(points) // _MOST_BORDER_POINTS)]
     _, slopes = sample_with_slope(distance[None], points)
     return points, normalize(slopes[:, 0], dim=-1)
+
+
+def drawing_camera(camera: Camera) -> Camera:
+    """The same view with few pixels, for what is drawn again at every step.
+
+    Outlines are still points on edges, and are compared at the picture's own resolution.
+    """
+    scale = _DRAWN_SIDE / max(camera.width, camera.height)
+    if scale >= 1:
+        return camera
+    return camera.resized(round(scale * camera.width), round(scale * camera.height))
 
 
 def sample_with_slope(

@@ -34,7 +34,7 @@ from handavatar.evaluate.metrics import (
     shading_correlation,
 )
 from handavatar.evaluate.perceptual import PerceptualLoss, perceptual_loss
-from handavatar.evaluate.run import float_image, held_out_pose
+from handavatar.evaluate.run import float_image, held_out_poses
 from handavatar.field.anchors import Neighbours
 from handavatar.field.layers import MLP
 from handavatar.field.shading import (
@@ -307,7 +307,7 @@ def fitted_geometry(capture: Capture, shape: Shape, method: Method, seed: int) -
     settings = RenderSettings(num_samples=method.num_samples)
     seen = find_seen_samples(avatar, frames, settings, method.warm_stride)
     seen = place_directions(avatar, frames, seen, seed)
-    tests = [_aligned(avatar, capture.frame(index)) for index in capture.split("test")]
+    tests = _aligned(avatar, [capture.frame(index) for index in capture.split("test")])
     views = [view_of_frame(avatar, frame, frame.camera, settings) for frame in tests]
     chosen = torch.linspace(0, len(tests) - 1, _TURNED_POSES).round().long().tolist()
     return FittedGeometry(
@@ -322,11 +322,16 @@ def fitted_geometry(capture: Capture, shape: Shape, method: Method, seed: int) -
     )
 
 
-def _aligned(avatar: HandAvatar, frame: Frame) -> Frame:
+def _aligned(avatar: HandAvatar, frames: list[Frame]) -> list[Frame]:
     """Tracked poses of test frames are drawn to their masks, as ``evaluate`` does."""
-    if frame.confidence == 1:
-        return frame
-    return replace(frame, pose=held_out_pose(avatar, frame))
+    tracked = [frame for frame in frames if frame.confidence < 1]
+    if not tracked:
+        return frames
+    found = {
+        frame.name: pose
+        for frame, pose in zip(tracked, held_out_poses(avatar, tracked), strict=True)
+    }
+    return [replace(frame, pose=found.get(frame.name, frame.pose)) for frame in frames]
 
 
 @torch.no_grad()

@@ -17,6 +17,7 @@ from handavatar.capture.view import view_of
 from handavatar.evaluate.metrics import mean_color
 from handavatar.evaluate.perceptual import PerceptualChoice, PerceptualLoss, perceptual_loss
 from handavatar.field.shading import CueSet, OrientedCues, PaperCues, TracedCues
+from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.rigs import find_rig
@@ -49,6 +50,7 @@ from handavatar.train.personal_occupancy import fit_occupancy
 from handavatar.train.pretraining import wide_and_narrow
 from handavatar.train.prior import SHIPPED_PRIOR, load_prior
 from handavatar.train.progress import Progress
+from handavatar.train.registration import register_training
 from handavatar.train.runs import (
     Checkpoint,
     Run,
@@ -443,21 +445,33 @@ def _fit_or_restore_outlines(
             for prefix, module in modules.items()
             for name, value in module.state_dict().items()
         }
+        tensors["coefficients"] = training.avatar.coefficients.clone()
         _save(run, training, tensors, 0)
         return tensors
     training.avatar.occupancy.sharpness = method.sharpness
     tensors = load_checkpoint(checkpoint).tensors["outlines"]
+    training.avatar.coefficients.copy_(tensors["coefficients"])
     for prefix, module in modules.items():
         module.load_state_dict(_named(tensors, prefix))
     return tensors
 
 
 def fit_geometry(training: Training, frames: list[Frame], method: Method, seed: int) -> None:
-    """What comes before the first step: shape, poses and decoder, from the masks alone."""
+    """What comes before the first step: poses, shape and decoder, from what the frames show."""
+    if training.corrections is not None:
+        with Progress("registration", 100) as progress:
+            found = register_training(
+                training.avatar,
+                training.corrections,
+                frames,
+                replace(RegisterOptions(), seed=seed),
+                lambda share: progress.update(round(100 * share)),
+            )
+        training.avatar.info["pose_error"] = round(found.pose_error, 3)
     fit_outlines(
         training.avatar,
-        training.corrections,
-        frames,
+        None,
+        corrected_frames(training, frames),
         method.outline_rounds,
         method.outline_visits,
         method.silhouette_size,

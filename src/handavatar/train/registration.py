@@ -1,0 +1,65 @@
+"""Poses and shape of a tracked capture, laid onto its frames before anything is learned."""
+
+from collections.abc import Callable, Sequence
+
+import torch
+
+from handavatar.avatar import HandAvatar
+from handavatar.capture.frames import Frame
+from handavatar.capture.registration import poses_of, register_frames
+from handavatar.fit.kinematics import nearest_rotations
+from handavatar.fit.register import Registered, RegisterOptions
+from handavatar.hand.pose import HandPose
+from handavatar.train.corrections import PoseCorrections
+
+_SHAPE_STEPS = 300
+_SHAPE_RATE = 3e-3
+
+
+def register_training(
+    avatar: HandAvatar,
+    corrections: PoseCorrections,
+    frames: Sequence[Frame],
+    options: RegisterOptions,
+    progress: Callable[[float], None] | None = None,
+) -> Registered:
+    """Gives an avatar that has not learned yet the shape, and its frames the poses, that fit.
+
+    Args:
+        avatar: its shape coefficients and shape offsets are set.
+        corrections: of the tracked poses, set as well.
+        frames: of training.
+        options: expected errors, rounds.
+        progress: told how far it is.
+    """
+    rig = avatar.coarse_rig.to("cpu")
+    hand = rig.shaped(avatar.coefficients.cpu())
+    found = register_frames([hand], frames, options, progress=progress)
+    for number, (frame, pose) in enumerate(zip(frames, poses_of(found), strict=True)):
+        rotations = nearest_rotations(pose.rotations, frame.pose.rotations)
+        corrections.set(
+            number,
+            frame.pose.to(avatar.device),
+            HandPose(rotations, pose.translation).to(avatar.device),
+        )
+    avatar.coefficients += found.shape_change.to(avatar.coefficients)
+    _fit_offsets(avatar, found)
+    return found
+
+
+@torch.enable_grad()
+def _fit_offsets(avatar: HandAvatar, found: Registered) -> None:
+    """Teaches the shape's network the skin that registration found, in all of its poses."""
+    rest = avatar.coarse_rig.shaped(avatar.coefficients)
+    target = found.hand.rest_vertices.to(avatar.device) - rest.rest_vertices
+    optimizer = torch.optim.Adam(avatar.shape.parameters(), lr=_SHAPE_RATE)
+    rotations = found.poses.rotations.to(avatar.device)
+    for step in range(_SHAPE_STEPS):
+        optimizer.param_groups[0]["lr"] = _SHAPE_RATE * 0.05 ** (step / _SHAPE_STEPS)
+        offsets = avatar.shape(rest, rotations[step % len(rotations)])
+        # Millimetres: of the order of one.
+        loss = (1e3 * (offsets - target)).square().mean()
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        optimizer.step()
+    optimizer.zero_grad(set_to_none=True)
