@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from made_frames import camera_over, draw, pose_at, calm_poses, scribble
 from jaxtyping import Float
+from made_frames import calm_poses, camera_over, draw, pose_at, scribble
 from torch import Tensor
 
 from handavatar.fit.pictures import FramePicture, blur, sample_with_slope
