@@ -1,5 +1,7 @@
 """The descent: no step raises a frame's energy, and the shape takes its share of the blame."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from made_frames import (
@@ -83,8 +85,9 @@ def test_no_step_raises_a_frames_energy(
 def test_no_step_raises_the_energy_of_a_sequence(
     rig: Rig, truth: HandPose, frames: list[Observation]
 ) -> None:
-    # Frames that differ much: motion speaks loudly, and neighbours pull at each other.
-    descent = _descent(rig.shaped(), frames, spoilt(truth, 6.0), 6.0, is_sequence=True)
+    # Frames that differ much, a fifteenth of a second apart: neighbours pull at each other.
+    fast = [replace(seen, time=number / 15) for number, seen in enumerate(frames)]
+    descent = _descent(rig.shaped(), fast, spoilt(truth, 6.0), 6.0, is_sequence=True)
     look = Look(0.7, 3.0)
     before = first = float(descent.energies(look).sum())
     for _ in range(5):
@@ -126,7 +129,10 @@ def test_covariances_shrink_where_something_is_seen(
 
 
 def test_a_changed_shape_is_found_from_outlines(rig: Rig, truth: HandPose) -> None:
-    """Coefficients of 0.8 standard deviations, of which half or more is found at once."""
+    """A coefficient of 0.8, which is 5.4 mm of skin: single ones trade with each other, skin not.
+
+    Four frames of 96 pixels leave 0.9 mm, measured; 0.6 mm where nothing is to be found.
+    """
     space = ShapeSpace.around(rig, 1.0, 2)
     change = torch.zeros(len(space.sigmas))
     change[0] = 0.8
@@ -136,18 +142,25 @@ def test_a_changed_shape_is_found_from_outlines(rig: Rig, truth: HandPose) -> No
     look = Look(0.7, 3.0)
     before = float(descent.energies(look).sum())
     descent.step_shape(look, 8)
-    found = descent.shared
-    print(found, before, float(descent.energies(look).sum()))
-    assert float(descent.energies(look).sum()) < 0.3 * before
-    assert 0.6 < float(found[0]) < 1.0
-    left = (space.shaped(rig.shaped(), found).rest_vertices - true_hand.rest_vertices).norm(dim=-1)
+    assert float(descent.energies(look).sum()) < 0.15 * before
+    hand = space.shaped(rig.shaped(), descent.shared)
+    left = (hand.rest_vertices - true_hand.rest_vertices).norm(dim=-1)
     blame = (rig.template_vertices - true_hand.rest_vertices).norm(dim=-1)
-    assert float(left.mean()) < 0.4 * float(blame.mean())
+    assert float(left.mean()) < 0.3 * float(blame.mean())
+    assert _size(hand) / _size(true_hand) == pytest.approx(1, abs=0.015)
+    assert _size(rig.shaped()) / _size(true_hand) < 0.96
+
+
+def _size(hand: ShapedHand) -> float:
+    return float((hand.rest_vertices - hand.rest_vertices.mean(0)).norm(dim=-1).mean())
 
 
 def test_a_true_shape_stays(rig: Rig, truth: HandPose, frames: list[Observation]) -> None:
-    space = ShapeSpace.around(rig, 0.5, 2)
+    """Within what masks of 96 pixels tell: one pixel is 3 mm; measured 0.6 and 1.1 mm."""
+    space = ShapeSpace.around(rig, 1.0, 2)
     descent = _descent(rig.shaped(), frames, truth, 1.0, space)
     descent.step_shape(Look(0.7, 1.5), 6)
-    assert float(descent.shared.abs().max()) < 0.25
-    assert float(moved_by(rig.shaped(), descent.poses, truth).max()) < 0.6
+    hand = space.shaped(rig.shaped(), descent.shared)
+    assert 1000 * float((hand.rest_vertices - rig.template_vertices).norm(dim=-1).mean()) < 1.0
+    apart = hand.posed(descent.poses).vertices - rig.shaped().posed(truth).vertices
+    assert 1000 * float(apart.norm(dim=-1).mean()) < 1.6
