@@ -16,10 +16,8 @@ from handavatar.fit.appearance import SkinColors, fit_colors
 from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
 from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, moved_pose, pose_difference
 from handavatar.fit.landmarks import landmark_rest, offset_tolerances
-from handavatar.fit.pictures import FramePicture
 from handavatar.fit.shape import ShapeSpace, fixed_shape
 from handavatar.fit.solver import Descent, Look
-from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import sample_surface_evenly
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
@@ -98,27 +96,6 @@ class Registered:
     energies: Float[Tensor, "frames"]
     pose_error: float
     colors: SkinColors | None
-
-
-def observe(
-    camera: Camera,
-    color: Float[Tensor, "height width 3"],
-    coverage: Float[Tensor, "height width"],
-    known: Tensor,
-    gain: Float[Tensor, "3"],
-    time: float,
-) -> Observation:
-    """One frame's observation from its picture.
-
-    Args:
-        camera: of the picture.
-        color: sRGB in [0, 1].
-        coverage: of each pixel by the hand.
-        known: false where neither is known.
-        gain: of the channels, by the frame's exposure.
-        time: seconds.
-    """
-    return Observation(FramePicture.of(camera, color, coverage, known, gain), time)
 
 
 @torch.no_grad()
