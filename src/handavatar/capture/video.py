@@ -121,7 +121,7 @@ class VideoOptions:
     """How the hand is first fitted, to landmarks alone."""
     register: RegisterOptions = field(
         default_factory=lambda: RegisterOptions(
-            coefficient_sigma=1.0, tilts=(25.0,), restarts=1, color_rounds=2
+            coefficient_sigma=1.0, tilts=(25.0,), restarts=1, color_rounds=1
         )
     )
     """How the hand is laid onto masks and colours."""

@@ -28,8 +28,10 @@ Progress = Callable[[float], None]
 
 _NUM_POINTS = 4096
 _WIDE, _MIDDLE, _NARROW = 6.0, 3.0, 1.5
-_TILTED_EVERY = 2
-_TRIED_STEPS = 3
+_FARTHEST = torch.tensor([0.2] * (NUM_UNKNOWNS - 3) + [0.02] * 3)
+"""Radians and metres by which a pose to begin anew from is moved, one standard deviation."""
+_TILTED_EVERY = 3
+_TRIED_STEPS = 2
 """Of each width, from a pose that is tried."""
 _FINE = 0.7
 """Pixels of blur while outlines alone are looked at."""
@@ -229,7 +231,7 @@ def begin_anew(descent: Descent, look: Look, generator: torch.Generator, is_near
         return
     around = descent.poses if is_near else descent.tracked
     spread = descent.information.diagonal(dim1=-2, dim2=-1).rsqrt()[bad]
-    change = torch.randn(len(bad), NUM_UNKNOWNS, generator=generator) * spread
+    change = torch.randn(len(bad), NUM_UNKNOWNS, generator=generator) * spread.minimum(_FARTHEST)
     start = HandPose(around.rotations[bad], around.translation[bad])
     _try(descent, look, bad, moved_pose(start, change))
 
