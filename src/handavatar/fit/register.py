@@ -7,6 +7,7 @@ how far they had to move. Colours come last, when the start is not spoilt, from 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float, Int
@@ -18,10 +19,10 @@ from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, moved_pose, pose
 from handavatar.fit.landmarks import landmark_rest, offset_tolerances
 from handavatar.fit.shape import ShapeSpace, fixed_shape
 from handavatar.fit.solver import Descent, Look
-from handavatar.geometry.meshes import sample_surface_evenly
+from handavatar.geometry.meshes import SurfacePoints, sample_surface_evenly
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
-from handavatar.hand.rig import ShapedHand
+from handavatar.hand.rig import Rig, ShapedHand
 
 Progress = Callable[[float], None]
 """Told the share that is done, in [0, 1]."""
@@ -131,7 +132,7 @@ def register(
     rig = hands[0].rig
     space = ShapeSpace.around(rig, options.coefficient_sigma) if learns_shape else fixed_shape(rig)
     generator = torch.Generator().manual_seed(options.seed)
-    surface = sample_surface_evenly(rig.template_vertices, rig.faces, _NUM_POINTS, generator)
+    surface = _compared_points(rig)
     none = RestPoints(torch.zeros(0, 3), torch.zeros(0, 16), torch.zeros(0, 3, 0))
     has_landmarks = any(seen.landmarks is not None for seen in observations)
     num_shapes = len(space.sigmas)
@@ -206,6 +207,13 @@ def register(
         error,
         colors,
     )
+
+
+@lru_cache(maxsize=4)
+def _compared_points(rig: Rig) -> SurfacePoints:
+    """Evenly spread over the rig's template; the same ones every time."""
+    generator = torch.Generator().manual_seed(0)
+    return sample_surface_evenly(rig.template_vertices, rig.faces, _NUM_POINTS, generator)
 
 
 def colored_look(descent: Descent, sigma: float) -> Look:

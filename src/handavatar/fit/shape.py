@@ -1,6 +1,7 @@
 """A person's own shape as few numbers: the rig's coefficients, and smooth swellings of the skin."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -73,6 +74,7 @@ def fixed_shape(rig: Rig) -> ShapeSpace:
     )
 
 
+@lru_cache(maxsize=4)
 def _smooth_waves(
     rig: Rig, count: int
 ) -> tuple[Float[Tensor, "vertices count"], Float[Tensor, "count"]]:

@@ -112,6 +112,10 @@ class Descent:
             self._blurred[key] = self.observations[frame].picture.blurred(sigma)
         return self._blurred[key]
 
+    def forget_blurred(self, sigma: float) -> None:
+        """Frees the pictures of one blur."""
+        self._blurred = {key: value for key, value in self._blurred.items() if key[1] != sigma}
+
     def see(self, look: Look) -> list[SeenColors]:
         """The colours that every frame shows, with the poses as they are."""
 
