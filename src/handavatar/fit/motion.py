@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.linalg import solveh_banded
 from torch import Tensor
 
@@ -33,7 +33,7 @@ class MotionTerms:
         weights: by which the changes of the three frames enter the residuals.
     """
 
-    first: Float[Tensor, "triples"]
+    first: Int[Tensor, "triples"]
     residuals: Float[Tensor, "triples 51"]
     weights: Float[Tensor, "triples 3 51"]
 
