@@ -29,10 +29,12 @@ LANDMARK_ERROR = 0.004
 """Metres by which a landmark is off, beside what the tracker itself admits."""
 DEPTH_ERROR = 0.025
 """Metres by which its depth is off: measured on made films."""
-_POSE_ERROR = np.radians(20.0) / 3**0.5
+_POSE_ERROR = np.radians(90.0) / 3**0.5
 """Radians by which joints are off where only the landmarks have spoken: they do so once more."""
 _PLACE_ERROR = 0.05
 """Metres."""
+_COMPARED_SIDE = 224
+"""Pixels of the hand's surroundings that the fit looks at: 1.5 to 2 mm each."""
 
 
 def window_view(hand: TrackedHand, focal: float) -> Camera:
@@ -63,23 +65,37 @@ def observe_hands(
     found = []
     for number, (hand, mask, is_known) in enumerate(zip(hands, masks, known, strict=True)):
         window = hand.window
+        view = window_view(hand, focal)
+        side = min(_COMPARED_SIDE, view.width)
         picture = FramePicture.of(
-            window_view(hand, focal),
-            torch.from_numpy(window.image).float() / 255,
-            torch.from_numpy(mask.level).float(),
-            torch.from_numpy(is_known),
+            view.resized(side, side),
+            _smaller(torch.from_numpy(window.image).float() / 255, side),
+            _smaller(torch.from_numpy(mask.level).float()[..., None], side)[..., 0],
+            _smaller(torch.from_numpy(is_known).float()[..., None], side)[..., 0] > 0.999,
             torch.from_numpy(gains[number]).float(),
         )
+        shrunk = side / view.width
         expected = torch.hypot(seen.uncertainty[number], LANDMARK_ERROR * seen.scale[number])
         depths = seen.world_landmarks[number, :, 2]
         landmarks = LandmarkSightings(
-            torch.from_numpy(window.from_picture(hand.landmarks)).float(),
-            expected * window.scale,
+            torch.from_numpy(window.from_picture(hand.landmarks)).float() * shrunk,
+            expected * window.scale * shrunk,
             depths - depths.mean(),
             torch.full_like(depths, DEPTH_ERROR),
         )
         found.append(Observation(picture, hand.time, landmarks))
     return found
+
+
+def _smaller(
+    image: Float[Tensor, "height width channels"], side: int
+) -> Float[Tensor, "side side channels"]:
+    """Means over the pixels that each new one covers."""
+    planes = image.permute(2, 0, 1)[None]
+    small = torch.nn.functional.interpolate(
+        planes, (side, side), mode="bilinear", antialias=True, align_corners=False
+    )
+    return small[0].permute(1, 2, 0)
 
 
 def register_hands(

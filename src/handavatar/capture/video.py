@@ -119,7 +119,11 @@ class VideoOptions:
     """The hand to lay onto the pictures: open-hand, an imported one (mano-right) or its file."""
     fit: FitOptions = field(default_factory=FitOptions)
     """How the hand is first fitted, to landmarks alone."""
-    register: RegisterOptions = field(default_factory=RegisterOptions)
+    register: RegisterOptions = field(
+        default_factory=lambda: RegisterOptions(
+            coefficient_sigma=1.0, tilts=(25.0,), restarts=1, color_rounds=1
+        )
+    )
     """How the hand is laid onto masks and colours."""
 
 
@@ -301,7 +305,7 @@ def _laid_on(
             _known_before_wrist(track, fitted, rig),
             gains,
             rig,
-            replace(options.register, color_sigmas=()),
+            replace(options.register, color_sigmas=(), restarts=0),
             lambda share: report(0.55 + 0.15 * share, "laying the hand onto the masks"),
         )
         guided = _guided_masks(track, fitted, rig, gains, report)
@@ -313,7 +317,7 @@ def _laid_on(
             [first & mask.known for first, mask in zip(before, guided, strict=True)],
             gains,
             rig,
-            replace(options.register, restarts=1, is_wide=False),
+            replace(options.register, is_wide=False),
             lambda share: report(0.75 + 0.15 * share, "laying the hand onto masks and colours"),
         )
     except CaptureError as error:
@@ -579,7 +583,7 @@ def _confidence(
     spread_metres = float(hand.spread.mean()) / pixels_per_metre(hand)
     return {
         "outline": float(np.clip((iou - 0.65) / 0.25, 0, 1)),
-        "landmarks": float(np.exp(-((error_metres / 0.008) ** 2))),
+        "landmarks": float(np.exp(-((error_metres / 0.012) ** 2))),
         "looks": float(np.exp(-((spread_metres / 0.015) ** 2))),
         "edges": float(np.clip((guided.edge_quality - 0.45) / 0.3, 0, 1)),
         "presence": float(np.clip(hand.presence / 0.9, 0, 1)),

@@ -9,13 +9,13 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from handavatar.geometry.cameras import Camera, project
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.pose import BONE_PARENTS, NUM_BONES, HandPose, bone_transforms
-from handavatar.hand.rig import PosedHand, ShapedHand
+from handavatar.hand.rig import ShapedHand
 
 NUM_UNKNOWNS = 3 * NUM_BONES + 3
 """Of one frame."""
@@ -58,10 +58,6 @@ class RestPoints:
     positions: Float[Tensor, "points 3"]
     skin_weights: Float[Tensor, "points bones"]
     directions: Float[Tensor, "points 3 shapes"]
-
-    def select(self, index: Int[Tensor, "selected"]) -> "RestPoints":
-        """Some of the points."""
-        return RestPoints(self.positions[index], self.skin_weights[index], self.directions[index])
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,11 +157,6 @@ def pixel_jacobian(
     rotation = camera.camera_from_world[:3, :3]
     flat = rotation[:2] - relative[..., None] * rotation[2]
     return pixels, depth, focal[:, None] * flat / depth[:, None, None]
-
-
-def posed_hand(hand: ShapedHand, pose: HandPose) -> PosedHand:
-    """The posed mesh, pose blend shapes included."""
-    return hand.posed(pose)
 
 
 def rest_with_pose(hand: ShapedHand, pose: HandPose) -> ShapedHand:

@@ -9,18 +9,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.fit.appearance import SkinColors, fit_colors
 from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
 from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, moved_pose, pose_difference
 from handavatar.fit.landmarks import landmark_rest, offset_tolerances
-from handavatar.fit.pictures import FramePicture
 from handavatar.fit.shape import ShapeSpace, fixed_shape
 from handavatar.fit.solver import Descent, Look
-from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import sample_surface_evenly
+from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import ShapedHand
 
@@ -29,6 +28,11 @@ Progress = Callable[[float], None]
 
 _NUM_POINTS = 4096
 _WIDE, _MIDDLE, _NARROW = 6.0, 3.0, 1.5
+_FARTHEST = torch.tensor([0.2] * (NUM_UNKNOWNS - 3) + [0.02] * 3)
+"""Radians and metres by which a pose to begin anew from is moved, one standard deviation."""
+_TILTED_EVERY = 3
+_TRIED_STEPS = 2
+"""Of each width, from a pose that is tried."""
 _FINE = 0.7
 """Pixels of blur while outlines alone are looked at."""
 _BAD = 1.3
@@ -50,6 +54,9 @@ class RegisterOptions:
     """Whether this error is learned from all frames together."""
     is_wide: bool = True
     """Whether the start may be off by a finger's width."""
+    tilts: tuple[float, ...] = ()
+    """Degrees by which whole hands are tilted, each way, to begin anew: outlines alone hardly tell
+    a hand that leans back from one that bends forward."""
     restarts: int = 4
     """Times that badly explained frames are begun anew."""
     color_sigmas: tuple[float, ...] = (3.0, 1.5)
@@ -91,27 +98,6 @@ class Registered:
     energies: Float[Tensor, "frames"]
     pose_error: float
     colors: SkinColors | None
-
-
-def observe(
-    camera: Camera,
-    color: Float[Tensor, "height width 3"],
-    coverage: Float[Tensor, "height width"],
-    known: Tensor,
-    gain: Float[Tensor, "3"],
-    time: float,
-) -> Observation:
-    """One frame's observation from its picture.
-
-    Args:
-        camera: of the picture.
-        color: sRGB in [0, 1].
-        coverage: of each pixel by the hand.
-        known: false where neither is known.
-        gain: of the channels, by the frame's exposure.
-        time: seconds.
-    """
-    return Observation(FramePicture.of(camera, color, coverage, known, gain), time)
 
 
 @torch.no_grad()
@@ -181,6 +167,11 @@ def register(
     report(0.15)
     descent.step_shape(Look(_FINE, _MIDDLE), 4)
     report(0.2)
+    for degrees in options.tilts:
+        begin_tilted(descent, Look(_FINE, _NARROW), degrees)
+        begin_like_neighbours(descent, Look(_FINE, _NARROW))
+        descent.step_shape(Look(_FINE, _NARROW), 2)
+    report(0.35)
     for turn in range(options.restarts):
         begin_anew(descent, Look(_FINE, _NARROW), generator, is_near=turn % 2 == 1)
     report(0.45)
@@ -196,20 +187,22 @@ def register(
     look, colors = Look(_FINE, _NARROW), None
     width = observations[0].picture.camera.width / 256
     for number, sigma in enumerate(options.color_sigmas):
+        descent.forget_blurred(look.sigma)
         for turn in range(options.color_rounds):
             look = colored_look(descent, sigma * width)
             colors = look.colors
             descent.step_poses(look, 2)
             done = number + (turn + 1) / options.color_rounds
             report(0.55 + 0.45 * done / len(options.color_sigmas))
+    energies, covariances = descent.judge(look)
     return Registered(
         descent.poses,
-        descent.covariances(look),
+        covariances,
         points_of(descent.shared, 0).hand,
         descent.shared[: rig.shape_directions.shape[-1] if learns_shape else 0],
         descent.shared[num_shapes:],
         descent.tracked_information(),
-        descent.energies(look),
+        energies,
         error,
         colors,
     )
@@ -232,20 +225,67 @@ def begin_anew(descent: Descent, look: Look, generator: torch.Generator, is_near
         generator: of the other poses.
         is_near: whether to begin around what was found, instead of around what was tracked.
     """
-    descent.step_poses(look, 4)
     before = descent.energies(look)
     bad = (before > _BAD * before.median()).nonzero()[:, 0]
     if len(bad) == 0:
         return
-    part = descent.select(bad)
-    around = part.poses if is_near else part.tracked
-    spread = part.information.diagonal(dim1=-2, dim2=-1).rsqrt()
-    change = torch.randn(len(bad), NUM_UNKNOWNS, generator=generator) * spread
-    part.poses = moved_pose(around, change)
+    around = descent.poses if is_near else descent.tracked
+    spread = descent.information.diagonal(dim1=-2, dim2=-1).rsqrt()[bad]
+    change = torch.randn(len(bad), NUM_UNKNOWNS, generator=generator) * spread.minimum(_FARTHEST)
+    start = HandPose(around.rotations[bad], around.translation[bad])
+    _try(descent, look, bad, moved_pose(start, change))
+
+
+def begin_tilted(descent: Descent, look: Look, degrees: float) -> None:
+    """Tries every frame with the whole hand tilted about its middle, four ways.
+
+    Args:
+        descent: of all frames.
+        look: by which frames are judged.
+        degrees: of the tilt.
+    """
+    # Neighbours lean alike: what one of them finds, the others are told afterwards.
+    frames = torch.arange(0, len(descent.observations), _TILTED_EVERY)
+    cameras = [seen.picture.camera.camera_from_world[:3, :3] for seen in descent.observations]
+    views = torch.stack(cameras)
+    for axis in (0, 1):
+        for sign in (-1.0, 1.0):
+            turn = torch.deg2rad(torch.tensor(sign * degrees)) * views[:, axis]
+            tilt = matrix_from_axis_angle(turn)
+            wrist = tilt @ matrix_from_axis_angle(descent.poses.rotations[:, 0])
+            rotations = descent.poses.rotations.clone()
+            rotations[:, 0] = axis_angle_from_matrix(wrist)
+            # About the hand's middle, so that it stays where it is seen.
+            middle = _middles(descent)
+            joint = descent.points_of(descent.shared, 0).hand.rest_joints[0]
+            arm = middle - joint - descent.poses.translation
+            translation = descent.poses.translation + arm - (tilt @ arm[..., None])[..., 0]
+            _try(descent, look, frames, HandPose(rotations[frames], translation[frames]))
+
+
+def begin_like_neighbours(descent: Descent, look: Look) -> None:
+    """Tries every frame with the joints of the frame before it, and of the one after it."""
+    count = len(descent.observations)
+    for step in (-1, 1):
+        frames = torch.arange(max(0, -step), count - max(0, step))
+        rotations = descent.poses.rotations[frames + step]
+        _try(descent, look, frames, HandPose(rotations, descent.poses.translation[frames]))
+
+
+def _middles(descent: Descent) -> Float[Tensor, "frames 3"]:
+    hand = descent.points_of(descent.shared, 0).hand
+    return hand.posed(descent.poses).vertices.mean(1)
+
+
+def _try(descent: Descent, look: Look, frames: Int[Tensor, "tried"], start: HandPose) -> None:
+    """Descends from other poses, and keeps those that explain their frames better."""
+    part = descent.select(frames)
+    before = part.energies(look)
+    part.poses = start
     for outlier in (_WIDE, _MIDDLE, look.outlier):
-        part.step_poses(replace(look, outlier=outlier), 4)
-    is_better = part.energies(look) < before[bad]
-    chosen = bad[is_better]
+        part.step_poses(replace(look, outlier=outlier), _TRIED_STEPS)
+    is_better = part.energies(look) < before
+    chosen = frames[is_better]
     rotations, translation = descent.poses.rotations.clone(), descent.poses.translation.clone()
     rotations[chosen] = part.poses.rotations[is_better]
     translation[chosen] = part.poses.translation[is_better]

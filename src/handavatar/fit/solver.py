@@ -112,10 +112,6 @@ class Descent:
             self._blurred[key] = self.observations[frame].picture.blurred(sigma)
         return self._blurred[key]
 
-    def forget_blurred(self, sigma: float) -> None:
-        """Frees the pictures of one blur."""
-        self._blurred = {key: value for key, value in self._blurred.items() if key[1] != sigma}
-
     def see(self, look: Look) -> list[SeenColors]:
         """The colours that every frame shows, with the poses as they are."""
 
@@ -131,6 +127,11 @@ class Descent:
     def energies(self, look: Look) -> Float[Tensor, "frames"]:
         """Of each frame, priors included."""
         return self._linearised(look, self.poses, self.shared).energies
+
+    def judge(self, look: Look) -> tuple[Float[Tensor, "frames"], Float[Tensor, "frames 51 51"]]:
+        """:meth:`energies` and :meth:`covariances` at once."""
+        here = self._linearised(look, self.poses, self.shared)
+        return here.energies, torch.linalg.inv(here.pose_blocks().double()).float()
 
     def covariances(self, look: Look) -> Float[Tensor, "frames 51 51"]:
         """Of each pose's errors, as the curvature of its energy says; neighbours held still."""

@@ -1,0 +1,153 @@
+"""The law of registration: no stage leaves poses farther from the truth than it found them."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from made_frames import (
+    calm_poses,
+    camera_over,
+    draw,
+    moved_by,
+    observe_all,
+    pose_at,
+    scribble,
+    spoilt,
+)
+
+from handavatar.fit.energy import Observation
+from handavatar.fit.pictures import FramePicture
+from handavatar.fit.register import Registered, RegisterOptions, register
+from handavatar.hand.pose import HandPose
+from handavatar.hand.rig import Rig
+
+QUICK = RegisterOptions(restarts=0, color_sigmas=(3.0,), color_rounds=1)
+"""One pass of every stage."""
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """Frames with their truth."""
+
+    truth: HandPose
+    observations: list[Observation]
+
+
+def _clip(rig: Rig, frames: int, size: int) -> Clip:
+    truth = calm_poses(rig, frames)
+    return Clip(truth, observe_all(rig.shaped(), truth, camera_over(size)))
+
+
+@pytest.fixture(scope="module")
+def clip(rig: Rig) -> Clip:
+    return _clip(rig, 10, 112)
+
+
+@pytest.fixture(scope="module")
+def short(rig: Rig) -> Clip:
+    return _clip(rig, 3, 64)
+
+
+def _registered(
+    rig: Rig, clip: Clip, tracked: HandPose, options: RegisterOptions, learns_shape: bool = True
+) -> Registered:
+    hand = rig.shaped()
+    return register([hand], clip.observations, tracked, None, options, learns_shape=learns_shape)
+
+
+def _parts(found: Registered) -> list[torch.Tensor]:
+    assert found.colors is not None
+    return [
+        found.poses.rotations,
+        found.poses.translation,
+        found.covariances,
+        found.information,
+        found.shape_change,
+        found.hand.rest_vertices,
+        found.energies,
+        found.colors.albedo,
+        found.colors.light,
+    ]
+
+
+def test_the_short_way_comes_nearer_too(rig: Rig, short: Clip) -> None:
+    tracked = spoilt(short.truth, 5.0)
+    told: list[float] = []
+    found = register([rig.shaped()], short.observations, tracked, None, QUICK, progress=told.append)
+    before = moved_by(rig.shaped(), tracked, short.truth)
+    after = moved_by(rig.shaped(), found.poses, short.truth)
+    assert float(after.mean()) < 0.8 * float(before.mean())
+    assert told == sorted(told) and told[-1] == 1.0
+    for covariance in found.covariances:
+        assert float(torch.linalg.eigvalsh(covariance.double())[0]) > 0
+
+
+@pytest.mark.slow
+def test_the_same_input_gives_the_same_bits(rig: Rig, short: Clip) -> None:
+    """Twice, and however many threads share the frames."""
+    tracked = spoilt(short.truth, 5.0)
+    options = RegisterOptions(restarts=1, color_sigmas=(1.5,), color_rounds=1)
+    threads = torch.get_num_threads()
+    results = []
+    try:
+        for count in (1, 2, 2):
+            torch.set_num_threads(count)
+            results.append(_parts(_registered(rig, short, tracked, options)))
+    finally:
+        torch.set_num_threads(threads)
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
+
+
+def test_what_is_unknown_counts_nothing(rig: Rig, short: Clip) -> None:
+    known = torch.ones(64, 64, dtype=torch.bool)
+    known[:26, 30:] = False
+    known[40:44, 30:36] = False
+    results = []
+    for is_scribbled in (False, True):
+        observations = []
+        for frame, seen in enumerate(short.observations):
+            camera = seen.picture.camera
+            color, coverage = draw(rig.shaped(), pose_at(short.truth, frame), camera)
+            if is_scribbled:
+                color, coverage = scribble(color, coverage, known, seed=frame)
+            picture = FramePicture.of(camera, color, coverage, known, torch.ones(3))
+            observations.append(Observation(picture, seen.time))
+        part = Clip(short.truth, observations)
+        results.append(_parts(_registered(rig, part, spoilt(short.truth, 4.0), QUICK)))
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
+
+
+def test_a_sequence_follows_its_times(rig: Rig, short: Clip) -> None:
+    """Frames far apart are registered as single ones are; landmarks' offsets are none."""
+    tracked = spoilt(short.truth, 3.0)
+    apart = [Observation(seen.picture, 10 * seen.time) for seen in short.observations]
+    single = register([rig.shaped()], apart, tracked, None, QUICK, learns_shape=False)
+    joined = register(
+        [rig.shaped()], apart, tracked, None, QUICK, is_sequence=True, learns_shape=False
+    )
+    assert torch.equal(single.poses.rotations, joined.poses.rotations)
+    assert len(single.shape_change) == len(single.offsets) == 0
+    assert torch.equal(single.hand.rest_vertices, rig.shaped().rest_vertices)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("degrees", "share"), [(5.0, 0.3), (2.0, 0.75)])
+def test_registered_poses_are_nearer_to_the_truth(
+    rig: Rig, clip: Clip, degrees: float, share: float
+) -> None:
+    """And how far the tracked ones were off is learned; measured: 6.9 mm to 1.0 of 5 degrees."""
+    hand, tracked = rig.shaped(), spoilt(clip.truth, degrees)
+    found = _registered(rig, clip, tracked, RegisterOptions())
+    before = moved_by(hand, tracked, clip.truth)
+    after = moved_by(hand, found.poses, clip.truth)
+    assert float(after.mean()) < share * float(before.mean())
+    # At least 95 % of the frames: of ten, all.
+    assert bool((after <= before).all())
+    assert found.pose_error == pytest.approx(degrees, rel=0.4)
+
+
+@pytest.mark.slow
+def test_exact_poses_stay(rig: Rig, clip: Clip) -> None:
+    found = _registered(rig, clip, clip.truth, RegisterOptions())
+    assert float(moved_by(rig.shaped(), found.poses, clip.truth).mean()) < 1.0
