@@ -6,19 +6,20 @@ from dataclasses import replace
 import pytest
 import torch
 from conftest import TINY, avatar_of_the_prior, bent_pose, lit_frame
-from handavatar.peers.textured_mesh import fit_textured_mesh
 from torch import Tensor
 
 from handavatar.alignment import aligned_pose
 from handavatar.avatar import HandAvatar, RenderSettings
 from handavatar.capture.frames import Frame, read_capture, write_capture
 from handavatar.evaluate.metrics import mean_color
-from handavatar.evaluate.perceptual import perceptual_loss
+from handavatar.evaluate.perceptual import GradientStructure, perceptual_loss
+from handavatar.evaluate.textured_mesh import fit_textured_mesh
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.peers.inverse_skinning import fit_inverse_skinning
 from handavatar.train.ablation import FrameScores
 from handavatar.train.appearance import find_seen_samples
 from handavatar.train.border import BORDER_REACH, border_pixels, fit_border
+from handavatar.train.detail import learn_detail
 from handavatar.train.loop import TrainOptions, begin_training, frame_losses
 from handavatar.train.outlines import EdgeSet, fit_outlines, small_mask
 
@@ -100,6 +101,15 @@ def _field(frames: list[Frame]) -> list[Tensor]:
     return [fit_inverse_skinning(avatar_of_the_prior(), frames, 2, 0)(frames[0])]
 
 
+def _detail(frames: list[Frame]) -> list[Tensor]:
+    avatar = avatar_of_the_prior()
+    avatar.start_from_color(torch.tensor([0.7, 0.5, 0.4]))
+    seen = find_seen_samples(avatar, frames, RenderSettings(num_samples=12), 2)
+    learned = learn_detail(avatar, frames, seen, 32, 3, GradientStructure(), 0.1, seed=0)
+    assert avatar.texture is not None and learned.seen_share > 0
+    return [avatar.texture.texels.detach(), learned.seen]
+
+
 def _scores(frames: list[Frame]) -> list[Tensor]:
     scores = FrameScores()
     for frame in frames:
@@ -122,6 +132,7 @@ def _for_people(frames: list[Frame]) -> list[Tensor]:
         _mean_colors,
         _texture,
         _field,
+        _detail,
         _scores,
         _for_people,
     ],
@@ -137,7 +148,16 @@ def test_scribbles_would_change_it_if_they_were_known() -> None:
     known, scribbled = (
         [replace(frame, known=everything) for frame in frames] for frames in (FRAMES, SCRIBBLED)
     )
-    for consumer in (_seen, _small_masks, _shapes, _aligned, _mean_colors, _texture, _scores):
+    for consumer in (
+        _seen,
+        _small_masks,
+        _shapes,
+        _aligned,
+        _mean_colors,
+        _texture,
+        _detail,
+        _scores,
+    ):
         pairs = zip(consumer(known), consumer(scribbled), strict=True)
         assert not all(a.shape == b.shape and torch.equal(a, b) for a, b in pairs), consumer
 

@@ -42,7 +42,7 @@ def test_noise_is_told_row_by_row(
     source = read_capture(tiny_capture)
     monkeypatch.setattr(
         registration,
-        "_registered_poses",
+        "register_capture",
         lambda capture: [source.frame(i).pose for i in range(len(source.records))],
     )
     options = RegistrationTableOptions(
@@ -68,7 +68,7 @@ def test_noise_is_told_row_by_row(
     assert "noise5, registered" in table.markdown()
     assert steps == [1, 2, 3, 4]
     # What was kept is not measured again.
-    monkeypatch.setattr(registration, "_registered_poses", lambda capture: 1 / 0)
+    monkeypatch.setattr(registration, "register_capture", lambda capture: 1 / 0)
     assert registration_table(options).record() == table.record()
 
 

@@ -153,11 +153,14 @@ def _made_video(
         translation=torch.cat([made_fit(number % 3).translation for number in range(_MADE)]),
     )
     track = Track("right", tuple(hands), {}, size)
-    fitted = FittedHands(several, torch.stack(vertices), torch.full((_MADE,), 0.002))
+    covariances = (1e-6 * torch.eye(51)).expand(_MADE, -1, -1)
+    errors = torch.full((_MADE,), 0.002)
+    fitted = FittedHands(several, torch.stack(vertices), errors, covariances)
     monkeypatch.setattr(video_module, "track_hand", lambda *_: track)
     monkeypatch.setattr(video_module, "video_frames", lambda *_: iter(()))
     monkeypatch.setattr(video_module, "_found_masks", lambda *_: [])
-    monkeypatch.setattr(video_module, "_fitted", lambda *_: fitted)
+    monkeypatch.setattr(video_module, "_fitted_to_landmarks", lambda *_: fitted)
+    monkeypatch.setattr(video_module, "_registered", lambda *_: fitted)
     return VideoOptions(tmp_path / "made.mp4", tmp_path / "out"), rig
 
 

@@ -15,14 +15,16 @@ from conftest import lit_frame, write_tiny_capture
 from PIL import Image
 
 from handavatar.avatar import CheckpointError, HandAvatar
-from handavatar.capture.frames import CaptureError, read_capture, write_capture
+from handavatar.capture.frames import CaptureError, Frame, read_capture, write_capture
 from handavatar.evaluate import baselines, textured_mesh
 from handavatar.evaluate import run as run_module
 from handavatar.evaluate.baselines import judged_frame
 from handavatar.evaluate.metrics import masked_psnr
 from handavatar.evaluate.run import EvaluateOptions, dropped_frames, evaluate_run
+from handavatar.fit.register import RegisterOptions
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import HandPose
+from handavatar.hand.rig import ShapedHand
 from handavatar.jobs.files import FolderInUse
 
 KEYS = {
@@ -180,13 +182,19 @@ def test_truth_is_compared_where_the_capture_has_it(
 def test_tracked_poses_are_fitted_to_masks_and_known_ones_are_not(
     avatar_file: Path, tiny_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen: list[torch.Tensor] = []
+    seen: list[list[Frame]] = []
 
-    def noted(avatar: object, pose: HandPose, camera: object, mask: torch.Tensor) -> HandPose:
-        seen.append(mask)
-        return pose
+    def noted(
+        hands: list[ShapedHand], frames: list[Frame], options: RegisterOptions, learns_shape: bool
+    ) -> list[HandPose]:
+        # By landmarks and masks, never by colours, and with the avatar's own shape.
+        assert options.color_sigmas == () and not learns_shape
+        assert len(hands) == len(frames)
+        seen.append(frames)
+        return [frame.pose for frame in frames]
 
-    monkeypatch.setattr(run_module, "aligned_pose", noted)
+    monkeypatch.setattr(run_module, "register_frames", noted)
+    monkeypatch.setattr(run_module, "registered_poses", lambda found: found)
     options = EvaluateOptions(
         avatar_file, tiny_capture, out=tmp_path / "known", max_frames=1, device="cpu"
     )
@@ -195,7 +203,8 @@ def test_tracked_poses_are_fitted_to_masks_and_known_ones_are_not(
     tracked = write_tiny_capture(tmp_path / "tracked", "ab", confidence=0.9)
     metrics = evaluate_run(replace(options, capture=tracked, out=tmp_path / "out"))
     # The judged frame, and the frame that the textured mesh is fitted to.
-    assert len(seen) == 2 and torch.equal(seen[0], read_capture(tracked).frame(1).alpha)
+    assert [[frame.name for frame in frames] for frames in seen] == [["000001"], ["000000"]]
+    assert torch.equal(seen[0][0].alpha, read_capture(tracked).frame(1).alpha)
     assert any("fitted to their masks" in note for note in metrics["notes"])
     assert metrics["protocol"] == "mask"
     assert list(metrics["protocols"]) == ["mask", "registered"]

@@ -22,14 +22,30 @@ def texture(rig: Rig) -> DetailTexture:
 
 
 def test_points_on_the_skin_find_their_own_place(rig: Rig, texture: DetailTexture) -> None:
+    """Exactly, if a corner of the face is the vertex nearest to the point, or the second nearest.
+
+    As far as the vertices around the nearest anchor go: in this pose fingers touch, and a point
+    whose nearest anchor is that of another finger takes the place there, as the albedo takes its
+    codes. A face much longer than the net around it (the wrist's are, up to 24 mm) may have no
+    such corner. Other points' places are no farther off than the nearest vertex around the anchor.
+    """
     posed = any_pose(rig, turn=0.4, shift=0.1)
     generator = torch.Generator().manual_seed(0)
-    points = sample_surface(posed.vertices, rig.faces, 2000, generator).positions(posed.vertices)
+    samples = sample_surface(posed.vertices, rig.faces, 2000, generator)
+    points = samples.positions(posed.vertices)
     near = nearest_anchors(place_anchors(rig, 256).positions(posed.vertices), points)
+    around = texture.around[near.indices[:, 0]]
+    two_nearest = torch.cdist(points, posed.vertices).topk(2, largest=False).indices
+    is_around = (two_nearest[..., None] == around[:, None]).any(-1).all(-1)
+    is_corner = (two_nearest[..., None] == samples.faces[:, None]).flatten(1).any(-1)
+    is_exact = is_around & is_corner
     faces, weights = texture.nearest(posed.vertices, points, near)
     found = (posed.vertices[rig.faces[faces]] * weights[..., None]).sum(1)
     distances = (found - points).norm(dim=-1)
-    assert float(distances.quantile(0.9)) < 1e-5 and float(distances.max()) < 5e-3
+    assert float(is_exact.float().mean()) > 0.9
+    assert float(distances[is_exact].max()) < 1e-6
+    bound = (posed.vertices[around] - points[:, None]).norm(dim=-1).amin(1)
+    assert bool((distances <= bound + 1e-6).all())
     places = texture.places(posed.vertices, points, near)
     expected = (rig.uv_coordinates[rig.uv_faces[faces]] * weights[..., None]).sum(1)
     torch.testing.assert_close(places, expected)

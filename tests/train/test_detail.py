@@ -60,8 +60,27 @@ def test_a_view_is_what_the_avatar_renders(avatar: HandAvatar, frames: list[Fram
     assert int(known.sum()) > 300
     found = view.albedo.float() * view.light.float()[..., None]
     assert float((found - rendering.color[window])[known].abs().mean()) < 0.01
-    assert torch.equal(view.truth, frame.image[window])
+    assert torch.equal(view.truth, frame.image[window]) and torch.equal(view.gain, frame.gain)
     assert 0 <= float(view.places.min()) <= float(view.places.max()) <= 1
+
+
+def test_a_view_knows_what_its_frame_knows_at_the_average_exposure(
+    avatar: HandAvatar, frames: list[Frame]
+) -> None:
+    frame, size = frames[0], frames[0].camera.width
+    known = torch.ones(size, size, dtype=torch.bool)
+    known[: size // 2] = False
+    gain = torch.tensor([0.9, 0.8, 0.7])
+    darker = replace(frame, image=(frame.image * gain).round().byte(), gain=gain, known=known)
+    (whole,) = _views(avatar, [frame])
+    (view,) = _views(avatar, [darker])
+    assert bool((whole.top + whole.is_known.nonzero()[:, 0] < size // 2).any())
+    rows, columns = view.is_known.nonzero().unbind(-1)
+    assert len(rows) > 100 and int(view.top + rows.min()) == size // 2
+    found = view.colors[rows, columns]
+    assert torch.equal(found, darker.colors[view.top + rows, view.left + columns])
+    truth = frame.colors[view.top + rows, view.left + columns]
+    assert float((found - truth).abs().max()) < 0.5 / 255 / 0.7 + 1e-6
 
 
 def test_the_light_of_pixels_is_the_illumination_along_their_rays(
@@ -178,3 +197,14 @@ def test_the_outlines_error_is_a_distance_in_pixels(avatar: HandAvatar) -> None:
     moved = torch.roll(frame.coverage, 3, dims=1)
     error = outline_error(posed.vertices, avatar.base_rig.faces, replace(frame, coverage=moved))
     assert 0.8 < error < 3
+    known = torch.zeros(96, 96, dtype=torch.bool)
+    nowhere = replace(frame, coverage=moved, known=known)
+    assert outline_error(posed.vertices, avatar.base_rig.faces, nowhere) == 0
+    known[:, :48] = True
+    half = replace(frame, known=known)
+    # The mask ends where the known does; that is no outline, and what lies beyond no error.
+    assert outline_error(posed.vertices, avatar.base_rig.faces, half) < 0.05
+    scribbled = replace(half, coverage=torch.where(known, frame.coverage, 255 - frame.coverage))
+    assert outline_error(posed.vertices, avatar.base_rig.faces, scribbled) == outline_error(
+        posed.vertices, avatar.base_rig.faces, half
+    )

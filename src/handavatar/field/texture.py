@@ -91,7 +91,8 @@ class DetailTexture(nn.Module):
         """The face nearest to each point, and where on it, as weights of its corners.
 
         Of the vertices around the nearest anchor the two nearest are taken, and of their faces the
-        nearest; where faces meet at an angle, the place on it is nearly the nearest one.
+        nearest; where faces meet at an angle, the place on it is nearly the nearest one. Where
+        fingers touch, the place is on that of the nearest anchor, as the codes are.
         """
         first, second, third = vertices[self.faces].unbind(1)
         along, across = second - first, third - first

@@ -61,13 +61,14 @@ class DetailView:
     """A training frame as the texture's steps see it, cut to the hand.
 
     Attributes:
-        truth: the picture.
+        truth: the picture; grey where nothing is known of it.
         albedo: without the texture.
         light: illumination.
         places: on the chart, (u, v) of what each pixel shows.
         is_known: pixels that are learned from; all else of the view is zero.
         top: row of the first pixel in the frame.
         left: its column.
+        gain: of the picture's red, green and blue, as in :class:`Frame`.
     """
 
     truth: UInt8[Tensor, "height width 3"]
@@ -77,6 +78,12 @@ class DetailView:
     is_known: Bool[Tensor, "height width"]
     top: int
     left: int
+    gain: Float[Tensor, "3"]
+
+    @property
+    def colors(self) -> Float[Tensor, "height width 3"]:
+        """The picture's colours at the capture's average exposure, as :attr:`Frame.colors`."""
+        return self.truth.float() / 255 / self.gain
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +160,7 @@ def _view_of(
     vertices, faces = posed.vertices, avatar.rig.faces
     # The wrist's cut hides what is behind it and has no place on the chart.
     whole = rasterize(posed.sealed_vertices, avatar.rig.sealed_faces, camera)
-    is_known = (frame.alpha > _COVERED).to(avatar.device) & (len(seen) > 0)
+    is_known = ((frame.alpha > _COVERED) & frame.known).to(avatar.device) & (len(seen) > 0)
     is_known &= whole.mask & (whole.face_index < len(faces))
     rows, columns = is_known.nonzero().unbind(-1)
     top, left = (int(v.min()) if len(v) else 0 for v in (rows, columns))
@@ -183,13 +190,14 @@ def _view_of(
         near = nearest_anchors(avatar.anchors.positions(vertices), points)
         places[is_known] = _texture_of(avatar).places(vertices, points, near)
     return DetailView(
-        truth=frame.image[window].to(avatar.device),
+        truth=frame.shown[window].to(avatar.device),
         albedo=surface[..., 3:].half(),
         light=lights.half(),
         places=places,
         is_known=is_known,
         top=top,
         left=left,
+        gain=frame.gain.to(avatar.device),
     )
 
 
@@ -303,13 +311,14 @@ def _unwrap_view(avatar: HandAvatar, frame: Frame, view: DetailView) -> UnwrapVi
     pose = frame.pose.to(avatar.device)
     vertices = avatar.personal(pose).posed(pose).vertices.cpu()
     height, width = view.is_known.shape
-    truth, albedo, light = view.truth.float().cpu() / 255, view.albedo.float().cpu(), view.light
-    light = light.float().cpu()
+    truth, albedo, light = view.colors.cpu(), view.albedo.float().cpu(), view.light.float().cpu()
     is_known = view.is_known.cpu()
     rendered = albedo * light[..., None]
     wanted = truth.clamp_min(_DARKEST).log() - rendered.clamp_min(_DARKEST).log()
     grey = truth.mean(-1)
-    inner = is_known[1:-1, 1:-1]
+    # What lies beside the known, the wall or a grey of ours, makes no picture sharper.
+    inner = is_known[1:-1, 1:-1] & is_known[:-2, 1:-1] & is_known[2:, 1:-1]
+    inner = inner & is_known[1:-1, :-2] & is_known[1:-1, 2:]
     curved = (
         4 * grey[1:-1, 1:-1] - grey[:-2, 1:-1] - grey[2:, 1:-1] - grey[1:-1, :-2] - grey[1:-1, 2:]
     )
@@ -377,17 +386,19 @@ def outline_error(
 ) -> float:
     """Mean distance between the outlines of a posed mesh and of a frame's mask, pixels.
 
-    The area between the two over the length of the mask's.
+    The area between the two over the length of the mask's, both of the known pixels alone.
 
     Args:
         vertices: metres, world.
         faces: of the mesh.
-        frame: whose mask and camera.
+        frame: whose mask, known pixels and camera.
     """
     covered = covered_pixels(vertices, faces, frame.camera.to("cpu"))
-    mask = frame.mask.cpu()
-    length = int((mask[1:] != mask[:-1]).sum() + (mask[:, 1:] != mask[:, :-1]).sum())
-    return int((covered != mask).sum()) / max(length, 1)
+    mask, known = frame.mask.cpu(), frame.known.cpu()
+    between_rows = (mask[1:] != mask[:-1]) & known[1:] & known[:-1]
+    between_columns = (mask[:, 1:] != mask[:, :-1]) & known[:, 1:] & known[:, :-1]
+    length = int(between_rows.sum() + between_columns.sum())
+    return int(((covered != mask) & known).sum()) / max(length, 1)
 
 
 def learn_texels(
@@ -468,7 +479,7 @@ def _patch(
     for level in levels:
         residual = residual + texture_at(level, places)
     albedo = detailed(view.albedo[window][is_known].float(), residual)
-    truth = view.truth[window].float() / 255
+    truth = view.colors[window]
     color = albedo * view.light[window][is_known].float()[:, None]
     return truth.masked_scatter(is_known[..., None], color), truth
 
