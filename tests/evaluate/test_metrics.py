@@ -15,8 +15,6 @@ from handavatar.evaluate.metrics import (
     REGION_MARGIN,
     JudgedFrame,
     albedo_psnr,
-    detail_correlation,
-    detail_ratio,
     dilated,
     exposed,
     mask_iou,
@@ -304,50 +302,3 @@ def test_shading_correlation_is_pearsons() -> None:
     assert shading_correlation([-s for s in shadings], shadings, masks) == pytest.approx(-1)
     flat = [torch.ones(48, 40)] * 2
     assert shading_correlation(flat, shadings, masks) == 0
-
-
-# --- detail ---------------------------------------------------------------------------------------
-
-
-def _textured(rendered: torch.Tensor, truth: torch.Tensor) -> JudgedFrame:
-    coverage = torch.zeros(60, 60)
-    coverage[5:55, 5:55] = 1
-    return JudgedFrame(rendered * coverage[..., None], coverage > 0.5, truth, coverage)
-
-
-def _fine(seed: int) -> torch.Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return 0.5 + 0.1 * torch.randn(60, 60, 3, generator=generator).clamp(-3, 3)
-
-
-def test_detail_of_the_truth_itself_is_whole_and_in_place() -> None:
-    frame = _textured(_fine(0), _fine(0))
-    assert detail_ratio([frame]) == pytest.approx(1, abs=1e-6)
-    assert detail_correlation([frame]) == pytest.approx(1, abs=1e-6)
-
-
-def test_blur_has_less_detail_and_other_detail_is_elsewhere() -> None:
-    truth = _fine(0)
-    blurred = _textured(0.5 + 0.5 * (truth - 0.5), truth)
-    assert detail_ratio([blurred]) == pytest.approx(0.5, abs=0.02)
-    assert detail_correlation([blurred]) > 0.99
-    other = _textured(_fine(1), truth)
-    assert detail_ratio([other]) == pytest.approx(1, abs=0.1)
-    assert abs(detail_correlation([other])) < 0.1
-    both = detail_ratio([blurred, other])
-    assert 0.5 < both < 1
-
-
-def test_neither_light_nor_the_border_counts_as_detail() -> None:
-    """A ramp of light changes little; what lies within two pixels of the border, nothing."""
-    truth = _fine(0)
-    ramp = torch.linspace(-0.1, 0.1, 60)[:, None, None]
-    assert detail_ratio([_textured(truth + ramp, truth)]) == pytest.approx(1, abs=0.03)
-    framed = truth.clone()
-    framed[:7] += 0.2
-    found = _textured(truth, framed)
-    inner = detail_correlation([found])
-    assert inner > 0.8
-    flat = torch.full((60, 60, 3), 0.5)
-    assert detail_ratio([_textured(truth, flat)]) == 0
-    assert detail_correlation([_textured(flat, truth)]) == 0

@@ -27,10 +27,6 @@ CORE_DEPTH = 6 / 256
 
 _WINDOW_SIGMA = 1.5
 _WINDOW_RADIUS = 5
-_DETAIL_BORDER = 2.0
-"""Pixels at the masks' border that are not asked for fine detail."""
-_LEAST_DETAIL = 1e-5
-"""Standard deviation below which detail is rounding."""
 _LUMINANCE_CONSTANT = 0.01**2
 _CONTRAST_CONSTANT = 0.03**2
 
@@ -420,56 +416,6 @@ def shading_correlation(
     predicted, true = predicted - predicted.mean(), true - true.mean()
     norm = float(predicted.norm() * true.norm())
     return float(predicted @ true) / norm if norm > 1e-12 else 0.0
-
-
-def detail_ratio(frames: Sequence[JudgedFrame]) -> float:
-    """How much fine detail the renderings have of what the photographs have; blur has less than 1.
-
-    Standard deviation of the picture less its blur (a Gaussian of 1.5 pixels) inside both masks,
-    that of the renderings over that of the photographs, over all frames and channels. Pixels within
-    two of a mask's border do not count. Zero where the photographs have no detail.
-    """
-    rendered, truth = _details(frames)
-    least = _LEAST_DETAIL * math.sqrt(truth.numel())
-    deviation = float(truth.norm())
-    return float(rendered.norm()) / deviation if deviation > least else 0.0
-
-
-def detail_correlation(frames: Sequence[JudgedFrame]) -> float:
-    """Whether fine detail is where the photographs have it: 1 if it is, 0 if it lies anywhere.
-
-    Pearson correlation of what :func:`detail_ratio` compares. Zero where there is no detail.
-    """
-    rendered, truth = _details(frames)
-    least = _LEAST_DETAIL * math.sqrt(truth.numel())
-    first, second = float(rendered.norm()), float(truth.norm())
-    if min(first, second) <= least:
-        return 0.0
-    return float((rendered * truth).sum()) / (first * second)
-
-
-def _details(frames: Sequence[JudgedFrame]) -> tuple[Tensor, Tensor]:
-    """Pictures less their blur, all pixels that count, less the mean of each channel; float64."""
-    rendered, truth = [], []
-    for frame in frames:
-        mask = frame.rendered_mask & frame.truth_mask
-        inside = ~dilated(~mask, _DETAIL_BORDER)
-        for pooled, picture in zip((rendered, truth), frame.on_black(), strict=True):
-            pooled.append((picture - _blurred_within(picture, mask))[inside])
-    whole = [torch.cat(pooled).double() for pooled in (rendered, truth)]
-    first, second = (values - values.mean(0) if len(values) else values for values in whole)
-    return first, second
-
-
-def _blurred_within(
-    image: Float[Tensor, "height width channels"], mask: Bool[Tensor, "height width"]
-) -> Float[Tensor, "height width channels"]:
-    """The Gaussian mean over those pixels of the window that lie in the mask; zero beside it."""
-    weight = mask[..., None].to(image)
-    both = torch.cat([image * weight, weight], dim=-1).movedim(-1, 0)
-    margin = (_WINDOW_RADIUS,) * 4
-    mean = _window_mean(torch.nn.functional.pad(both, margin)).movedim(0, -1)
-    return mean[..., :-1] / mean[..., -1:].clamp_min(1e-6) * weight
 
 
 def _pooled(

@@ -235,6 +235,11 @@ def learn_detail(
     unwrapped = unwrap_frames(avatar, frames, views)
     tell()
     with Progress("detail", steps) as progress:
+
+        def told(step: int, figures: dict[str, float]) -> None:
+            progress.update(step, **figures)
+            tell()
+
         learned = learn_texels(
             unwrapped.residual,
             views,
@@ -242,7 +247,7 @@ def learn_detail(
             perceptual,
             perceptual_weight,
             seed,
-            lambda step, figures: (progress.update(step, **figures), tell()),
+            told,
         )
     with torch.no_grad():
         texture.texels.copy_(faded(learned, unwrapped.seen))
