@@ -171,6 +171,7 @@ def test_a_folder_in_use_is_refused_before_any_work(tmp_path: Path) -> None:
     assert (tmp_path / "mine.txt").read_text() == "keep me"
 
 
+@pytest.mark.slow
 @pytest.mark.real
 @needs_real_video
 def test_the_real_hand_becomes_a_sound_capture(tmp_path: Path) -> None:

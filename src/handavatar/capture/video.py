@@ -263,7 +263,7 @@ def capture_video(
     # By time, over all pictures, before anybody knows which of them can be fitted.
     splits = splits_by_index(track)
     fitted, results = _laid_on(track, rig, options, report)
-    report(0.95, "writing")
+    report(0.96, "writing")
     left_out = _left_out(track, results)
     kept = [result for result in results if result.frame.name not in left_out]
     if len(kept) < _MIN_KEPT:
