@@ -24,7 +24,7 @@ from handavatar.hand.pose import (
     skinning_jacobian,
 )
 from handavatar.hand.rig import ShapedHand
-from handavatar.render.rasterize import rasterize
+from handavatar.render.rasterize import covered_pixels, rasterize
 
 # Both pictures are blurred by so much, pixels of 256, and stepped on so many times.
 _LEVELS = ((3.0, 3), (1.5, 3), (0.7, 2))
@@ -61,6 +61,10 @@ class _Points:
     camera: Camera
 
 
+_LOST_OVERLAP = 0.003
+"""Of the overlap of mesh and mask: so much may go for better colours."""
+
+
 @torch.no_grad()
 def registered_pose(
     avatar: HandAvatar, frame: Frame, start: HandPose, rendering: Rendering | None = None
@@ -68,7 +72,7 @@ def registered_pose(
     """A pose near the start at which the frozen avatar's colours lie on the picture's.
 
     Unknown pixels say nothing. The start is returned as it is where the colours would not agree
-    better, or where too little of the hand is visible.
+    better, where the mesh would leave the mask for it, or where too little of the hand is visible.
 
     Args:
         avatar: its colours stay as they are.
@@ -97,7 +101,16 @@ def registered_pose(
         found, last = _descended(points, level, start, found, steps), level
     if last is None or not _photometric(points, last, found) < _photometric(points, last, start):
         return start.to(device)
-    return found.to(device)
+    # Colours alone may drift across the outline, which they do not look at.
+    before, after = (_overlap(hand, pose, frame) for pose in (start, found))
+    return (found if after >= before - _LOST_OVERLAP else start).to(device)
+
+
+def _overlap(hand: ShapedHand, pose: HandPose, frame: Frame) -> float:
+    """Intersection over union of the posed mesh and the mask, known pixels alone."""
+    covered = covered_pixels(hand.posed(pose).vertices, hand.rig.faces, frame.camera.to("cpu"))
+    covered = covered & frame.known
+    return int((covered & frame.mask).sum()) / max(int((covered | frame.mask).sum()), 1)
 
 
 def _on_cpu(hand: ShapedHand) -> ShapedHand:
