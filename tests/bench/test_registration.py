@@ -142,7 +142,7 @@ def test_nothing_kept_leaves_errors_open(small_film: FilmTruth) -> None:
 def test_a_film_goes_all_the_way(tmp_path: Path) -> None:
     pytest.importorskip("mediapipe")
     film = FilmOptions(
-        "short", 21, 0.2, ("spread", "relaxed"), width=320, height=240, seconds=1.6, fps=10
+        "short", 21, 0.2, ("spread", "relaxed"), width=320, height=240, seconds=1.6, fps=10.0
     )
     make_film(film, tmp_path / "films")
     options = RegistrationTableOptions(films=tmp_path / "films", cases=("video",))

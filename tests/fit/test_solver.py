@@ -51,6 +51,7 @@ def _descent(
         is_sequence=is_sequence,
         poses=tracked,
         shared=torch.zeros(len(space.sigmas)),
+        threads=1,
     )
 
 

@@ -28,7 +28,7 @@ from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import ShapedHand
-from handavatar.render.silhouette import OutlinePoints, rough_outline_points
+from handavatar.render.silhouette import OutlinePoints, outline_points
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ def _add_outlines(
     camera = picture.camera
     unit = camera.width / 256 * options.outline_error
     far = outlier / options.outline_error
-    outline = rough_outline_points(vertices, hand.rig.faces, drawing_camera(camera))
+    outline = outline_points(vertices, hand.rig.faces, drawing_camera(camera))
     if len(outline.ends) == 0:
         return
     rest = _outline_rest(points, hand, outline)

@@ -23,6 +23,7 @@ from handavatar.geometry.meshes import SurfacePoints, sample_surface_evenly
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import Rig, ShapedHand
+from handavatar.jobs.threads import one_thread
 
 Progress = Callable[[float], None]
 """Told the share that is done, in [0, 1]."""
@@ -32,6 +33,7 @@ _WIDE, _MIDDLE, _NARROW = 6.0, 3.0, 1.5
 _FARTHEST = torch.tensor([0.2] * (NUM_UNKNOWNS - 3) + [0.02] * 3)
 """Radians and metres by which a pose to begin anew from is moved, one standard deviation."""
 _TILTED_EVERY = 3
+_THOROUGH_STEPS = 4
 _TRIED_STEPS = 2
 """Of each width, from a pose that is tried."""
 _FINE = 0.7
@@ -128,7 +130,35 @@ def register(
         start: offsets of the landmarks to begin with, where there are landmarks; zeros if None.
         progress: told how far it is.
     """
-    report = progress or (lambda share: None)
+    threads = torch.get_num_threads()
+    with one_thread():
+        return _register(
+            hands,
+            observations,
+            tracked,
+            information,
+            options,
+            is_sequence,
+            learns_shape,
+            start,
+            progress or (lambda share: None),
+            threads,
+        )
+
+
+def _register(
+    hands: Sequence[ShapedHand],
+    observations: Sequence[Observation],
+    tracked: HandPose,
+    information: Float[Tensor, "frames 51 51"] | None,
+    options: RegisterOptions,
+    is_sequence: bool,
+    learns_shape: bool,
+    start: Float[Tensor, "63"] | None,
+    report: Progress,
+    threads: int,
+) -> Registered:
+    """As :func:`register`; frames are shared out among threads, all else is done by one."""
     rig = hands[0].rig
     space = ShapeSpace.around(rig, options.coefficient_sigma) if learns_shape else fixed_shape(rig)
     generator = torch.Generator().manual_seed(options.seed)
@@ -162,6 +192,7 @@ def register(
         is_sequence=is_sequence,
         poses=tracked,
         shared=shared,
+        threads=threads,
     )
     for outlier in (_WIDE, _MIDDLE) if options.is_wide else (_MIDDLE,):
         descent.step_poses(Look(_FINE, outlier), 4)
@@ -233,6 +264,7 @@ def begin_anew(descent: Descent, look: Look, generator: torch.Generator, is_near
         generator: of the other poses.
         is_near: whether to begin around what was found, instead of around what was tracked.
     """
+    descent.step_poses(look, 4)
     before = descent.energies(look)
     bad = (before > _BAD * before.median()).nonzero()[:, 0]
     if len(bad) == 0:
@@ -241,7 +273,7 @@ def begin_anew(descent: Descent, look: Look, generator: torch.Generator, is_near
     spread = descent.information.diagonal(dim1=-2, dim2=-1).rsqrt()[bad]
     change = torch.randn(len(bad), NUM_UNKNOWNS, generator=generator) * spread.minimum(_FARTHEST)
     start = HandPose(around.rotations[bad], around.translation[bad])
-    _try(descent, look, bad, moved_pose(start, change))
+    _try(descent, look, bad, moved_pose(start, change), _THOROUGH_STEPS)
 
 
 def begin_tilted(descent: Descent, look: Look, degrees: float) -> None:
@@ -268,7 +300,13 @@ def begin_tilted(descent: Descent, look: Look, degrees: float) -> None:
             joint = descent.points_of(descent.shared, 0).hand.rest_joints[0]
             arm = middle - joint - descent.poses.translation
             translation = descent.poses.translation + arm - (tilt @ arm[..., None])[..., 0]
-            _try(descent, look, frames, HandPose(rotations[frames], translation[frames]))
+            _try(
+                descent,
+                look,
+                frames,
+                HandPose(rotations[frames], translation[frames]),
+                _TRIED_STEPS,
+            )
 
 
 def begin_like_neighbours(descent: Descent, look: Look) -> None:
@@ -277,7 +315,8 @@ def begin_like_neighbours(descent: Descent, look: Look) -> None:
     for step in (-1, 1):
         frames = torch.arange(max(0, -step), count - max(0, step))
         rotations = descent.poses.rotations[frames + step]
-        _try(descent, look, frames, HandPose(rotations, descent.poses.translation[frames]))
+        start = HandPose(rotations, descent.poses.translation[frames])
+        _try(descent, look, frames, start, _TRIED_STEPS)
 
 
 def _middles(descent: Descent) -> Float[Tensor, "frames 3"]:
@@ -285,13 +324,15 @@ def _middles(descent: Descent) -> Float[Tensor, "frames 3"]:
     return hand.posed(descent.poses).vertices.mean(1)
 
 
-def _try(descent: Descent, look: Look, frames: Int[Tensor, "tried"], start: HandPose) -> None:
+def _try(
+    descent: Descent, look: Look, frames: Int[Tensor, "tried"], start: HandPose, steps: int
+) -> None:
     """Descends from other poses, and keeps those that explain their frames better."""
     part = descent.select(frames)
     before = part.energies(look)
     part.poses = start
     for outlier in (_WIDE, _MIDDLE, look.outlier):
-        part.step_poses(replace(look, outlier=outlier), _TRIED_STEPS)
+        part.step_poses(replace(look, outlier=outlier), steps)
     is_better = part.energies(look) < before
     chosen = frames[is_better]
     rotations, translation = descent.poses.rotations.clone(), descent.poses.translation.clone()

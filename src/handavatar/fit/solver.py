@@ -65,6 +65,7 @@ class Descent:
         is_sequence: whether the frames follow each other in time.
         poses: as found so far.
         shared: unknowns that all frames share: shape, offsets of landmarks.
+        threads: among which the frames are shared out.
     """
 
     observations: list[Observation]
@@ -77,6 +78,7 @@ class Descent:
     is_sequence: bool
     poses: HandPose
     shared: Float[Tensor, "shared"]
+    threads: int
     damping: Float[Tensor, "frames"] = field(init=False)
     shared_damping: float = 1e-2
     _blurred: dict[tuple[int, float], BlurredPicture] = field(default_factory=dict)
@@ -126,7 +128,7 @@ class Descent:
             blurred = self.blurred(frame, look.sigma)
             return see_colors(points.hand.rig, vertices, points.surface, picture, blurred)
 
-        return mapped(seen, range(len(self.observations)))
+        return mapped(seen, range(len(self.observations)), self.threads)
 
     def energies(self, look: Look) -> Float[Tensor, "frames"]:
         """Of each frame, priors included."""
@@ -165,7 +167,10 @@ class Descent:
             )
             return part.hessian[:NUM_UNKNOWNS, :NUM_UNKNOWNS]
 
-        found = torch.stack(mapped(seen, range(len(self.observations)))) + self.information
+        found = (
+            torch.stack(mapped(seen, range(len(self.observations)), self.threads))
+            + self.information
+        )
         times = self.times if self.is_sequence else self.times[:0]
         return found + torch.diag_embed(motion_terms(self.poses, times).curvature(len(found)))
 
@@ -226,7 +231,7 @@ class Descent:
                 self.options,
             )
 
-        parts = mapped(linearised, range(len(self.observations)))
+        parts = mapped(linearised, range(len(self.observations)), self.threads)
         hessian = torch.stack([part.hessian for part in parts])
         gradient = torch.stack([part.gradient for part in parts])
         energies = torch.tensor([part.energy for part in parts])

@@ -5,8 +5,9 @@ operations on such pieces too finely to gain anything. Pieces are independent, s
 not depend on the number of threads.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from typing import TypeVar
 
@@ -16,8 +17,16 @@ Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
 
-def mapped(function: Callable[[Piece], Result], pieces: Iterable[Piece]) -> list[Result]:
-    """``function`` of every piece, in order, without gradient."""
+def mapped(
+    function: Callable[[Piece], Result], pieces: Iterable[Piece], count: int | None = None
+) -> list[Result]:
+    """``function`` of every piece, in order, without gradient.
+
+    Args:
+        function: of one piece.
+        pieces: of the work.
+        count: of threads; by default as many as torch has.
+    """
 
     def without_gradient(piece: Piece) -> Result:
         # Gradient mode and inner threads belong to the thread, not to the process.
@@ -26,14 +35,26 @@ def mapped(function: Callable[[Piece], Result], pieces: Iterable[Piece]) -> list
             return function(piece)
 
     work = list(pieces)
-    count = torch.get_num_threads()
+    before = torch.get_num_threads()
+    count = before if count is None else count
     if count == 1 or len(work) == 1:
         with torch.no_grad():
             return [function(piece) for piece in work]
     try:
         return list(_pool(count).map(without_gradient, work))
     finally:
-        torch.set_num_threads(count)
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Torch's own operations on one thread: sums do not depend on how many there are."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @cache

@@ -183,41 +183,6 @@ def outline_points(
     return OutlinePoints(pieces.ends, (pieces.low + pieces.high) / 2, (end - start).norm(dim=-1))
 
 
-@torch.no_grad()
-def rough_outline_points(
-    vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"], camera: Camera
-) -> OutlinePoints:
-    """The middles of the outline's edges, at half the cost of :func:`outline_points`.
-
-    An edge counts if a pixel beside its middle sees nothing: where one part of the mesh passes
-    behind another, the ends of the outline are known to a pixel.
-
-    Args:
-        vertices: metres, world.
-        faces: consistently wound; the mesh may be open.
-        camera: the view; parts outside the picture are left out.
-    """
-    pixels, depths = project(camera, vertices)
-    edges = _contour_edges(pixels, faces[is_before_camera(depths[faces])])
-    start, end = pixels[edges].unbind(1)
-    along = end - start
-    lengths = along.norm(dim=-1)
-    across = torch.stack([-along[:, 1], along[:, 0]], dim=-1) / lengths.clamp_min(1e-6)[:, None]
-    covered = covered_pixels(vertices, faces, camera)
-    size = pixels.new_tensor([camera.width, camera.height])
-    middle = (start + end) / 2
-    is_free = torch.zeros(len(edges), dtype=torch.bool, device=pixels.device)
-    for side in (-1.0, 1.0):
-        place = middle + side * across
-        column, row = place.floor().long().unbind(-1)
-        is_inside = ((place >= 0) & (place < size)).all(-1)
-        hit = covered[row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1)]
-        is_free |= ~(is_inside & hit)
-    is_free &= ((middle >= 0) & (middle < size)).all(-1) & (lengths > 1e-6)
-    half = torch.full_like(lengths[is_free], 0.5)
-    return OutlinePoints(edges[is_free], half, lengths[is_free])
-
-
 def signed_distance(coverage: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
     """Pixels from each pixel's centre to the outline of what covers them, negative inside.
 
