@@ -47,7 +47,7 @@ def window_view(hand: TrackedHand, focal: float) -> Camera:
 def observe_hands(
     hands: Sequence[TrackedHand],
     masks: Sequence[HandMask],
-    known: Sequence[Bool[np.ndarray, "side side"]],
+    known: Sequence[Bool[np.ndarray, "_ _"]],
     gains: Float[np.ndarray, "hands 3"],
     seen: Observations,
     focal: float,

@@ -410,7 +410,7 @@ def _registered(
     track: Track,
     masks: Sequence[HandMask],
     before: FittedHands,
-    known: Sequence[Bool[np.ndarray, "side side"]],
+    known: Sequence[Bool[np.ndarray, "_ _"]],
     gains: Float[np.ndarray, "hands 3"],
     rig: Rig,
     options: RegisterOptions,
@@ -437,7 +437,7 @@ def _judged_fit(
 
 def _known_before_wrist(
     track: Track, fitted: FittedHands, rig: Rig
-) -> list[Bool[np.ndarray, "side side"]]:
+) -> list[Bool[np.ndarray, "_ _"]]:
     """Pixels of the camera's picture in front of the wrist: what lies behind is the forearm's."""
     rim = rig.rim.numpy()
     found = []
