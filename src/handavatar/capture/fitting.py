@@ -5,8 +5,6 @@ First the landmarks alone decide; then the mesh's outline is drawn to the mask's
 """
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
@@ -23,6 +21,7 @@ from handavatar.hand.pose_sampling import (
     limit_excess,
 )
 from handavatar.hand.rig import Rig
+from handavatar.jobs.threads import one_thread
 
 _LONG_FINGERS = ("index", "middle", "ring", "little")
 _PALM_LANDMARKS = (0, 1, 5, 9, 13, 17)
@@ -116,18 +115,7 @@ class PairFinder(Protocol):
         ...
 
 
-@contextmanager
-def single_threaded() -> Iterator[None]:
-    """One thread for small tensors: waiting for a second one costs up to fifty times the work."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
-@single_threaded()
+@one_thread()
 def fit_hands(
     rig: Rig,
     observations: Observations,
@@ -243,7 +231,7 @@ def placed(model: HandModel, observations: Observations, fit: HandFit) -> HandFi
     return replace(fit, translation=torch.cat([translation[:, :2], depth[:, None]], dim=1))
 
 
-@single_threaded()
+@one_thread()
 def refined(
     model: HandModel,
     observations: Observations,

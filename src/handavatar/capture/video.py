@@ -24,7 +24,6 @@ from handavatar.capture.fitting import (
     Observations,
     fit_hands,
     landmark_errors,
-    single_threaded,
 )
 from handavatar.capture.frames import SPLITS, Capture, CaptureWriter, Frame, read_capture
 from handavatar.capture.guided_masks import (
@@ -66,6 +65,7 @@ from handavatar.geometry.cameras import project
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import FolderKind, files_named, mark_folder
+from handavatar.jobs.threads import one_thread
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -343,7 +343,7 @@ def _found_masks(track: Track, report: Progress) -> list[HandMask]:
     )
 
 
-@single_threaded()
+@one_thread()
 def _guided_masks(
     track: Track,
     fitted: FittedHands,
@@ -397,7 +397,7 @@ def observations_of(track: Track) -> Observations:
     )
 
 
-@single_threaded()
+@one_thread()
 def _fitted_to_landmarks(track: Track, rig: Rig, options: VideoOptions) -> FittedHands:
     """Where the landmarks alone have the hand, with its shape and the focal length."""
     observations = observations_of(track)
