@@ -118,7 +118,7 @@ def test_covariances_shrink_where_something_is_seen(
 ) -> None:
     descent = _descent(rig.shaped(), frames, truth, 5.0)
     prior = torch.linalg.inv(descent.information[0])
-    for covariance in descent.covariances(Look(0.7, 1.5)):
+    for covariance in descent.judge(Look(0.7, 1.5))[1]:
         torch.testing.assert_close(covariance, covariance.T, rtol=1e-3, atol=1e-9)
         assert float(torch.linalg.eigvalsh(covariance.double())[0]) > 0
         # Nothing is surer of its opposite, and the outline tells where the hand lies.

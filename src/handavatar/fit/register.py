@@ -356,10 +356,10 @@ def _learned_error(descent: Descent, look: Look, error: float) -> float:
     One step of expectation and maximisation for a single variance, of all frames that are well
     explained.
     """
-    energies = descent.energies(look)
+    energies, covariances = descent.judge(look)
     is_good = energies < _BAD * energies.median()
     moved = pose_difference(descent.tracked, descent.poses)[is_good, :-3]
-    variances = descent.covariances(look).diagonal(dim1=-2, dim2=-1)[is_good, :-3]
+    variances = covariances.diagonal(dim1=-2, dim2=-1)[is_good, :-3]
     mean = (moved.square() + variances).mean()
     found = float(torch.rad2deg((3 * mean).sqrt()))
     return min(max(found, _LEAST_ERROR), _MOST_ERROR)

@@ -49,6 +49,10 @@ class Look:
     color_error: float = 1.0
 
 
+_BLIND = Look(0.7, 1.0)
+"""For landmarks, which look at no picture."""
+
+
 @dataclass(eq=False)
 class Descent:
     """The unknowns of a fit, and where they are now.
@@ -58,7 +62,6 @@ class Descent:
         times: of the frames, seconds; successive ones keep each other even.
         tracked: poses to stay near.
         information: how near, the inverse covariance of each tracked pose's errors.
-        base: the rest hand to start from.
         points_of: the hand for given shared unknowns.
         shared_sigmas: expected size of the shared unknowns.
         options: expected errors.
@@ -135,14 +138,12 @@ class Descent:
         return self._linearised(look, self.poses, self.shared).energies
 
     def judge(self, look: Look) -> tuple[Float[Tensor, "frames"], Float[Tensor, "frames 51 51"]]:
-        """:meth:`energies` and :meth:`covariances` at once."""
+        """Energies, and covariances of the poses' errors as the curvature of the energy says.
+
+        For these, neighbours in time are held still.
+        """
         here = self._linearised(look, self.poses, self.shared)
         return here.energies, torch.linalg.inv(here.pose_blocks().double()).float()
-
-    def covariances(self, look: Look) -> Float[Tensor, "frames 51 51"]:
-        """Of each pose's errors, as the curvature of its energy says; neighbours held still."""
-        here = self._linearised(look, self.poses, self.shared)
-        return torch.linalg.inv(here.pose_blocks().double()).float()
 
     def tracked_information(self) -> Float[Tensor, "frames 51 51"]:
         """What landmarks, motion and the tracked poses say of each pose; neither masks nor colours.
@@ -151,26 +152,9 @@ class Descent:
         this.
         """
         blind = replace(self.options, outline_points=0.0)
-        look = Look(0.7, 1.0)
-
-        def seen(frame: int) -> Tensor:
-            part = linearise_frame(
-                self.points_of(self.shared, frame),
-                _at(self.poses, frame),
-                self.observations[frame],
-                self.blurred(frame, look.sigma),
-                None,
-                look.color_error,
-                look.sigma,
-                look.outlier,
-                blind,
-            )
-            return part.hessian[:NUM_UNKNOWNS, :NUM_UNKNOWNS]
-
-        found = (
-            torch.stack(mapped(seen, range(len(self.observations)), self.threads))
-            + self.information
-        )
+        parts = self._linearised_frames(_BLIND, self.poses, self.shared, blind)
+        own = slice(NUM_UNKNOWNS)
+        found = torch.stack([part.hessian[own, own] for part in parts]) + self.information
         times = self.times if self.is_sequence else self.times[:0]
         return found + torch.diag_embed(motion_terms(self.poses, times).curvature(len(found)))
 
@@ -217,7 +201,11 @@ class Descent:
         factor = torch.where(is_better, _FURTHER, _BACK)
         self.damping = (self.damping * factor).clamp(_LEAST_DAMPING, _MOST_DAMPING)
 
-    def _linearised(self, look: Look, poses: HandPose, shared: Float[Tensor, "shared"]) -> "_Whole":
+    def _linearised_frames(
+        self, look: Look, poses: HandPose, shared: Float[Tensor, "shared"], options: EnergyOptions
+    ) -> list[Linearised]:
+        """What each frame's own observations say."""
+
         def linearised(frame: int) -> Linearised:
             return linearise_frame(
                 self.points_of(shared, frame),
@@ -228,10 +216,13 @@ class Descent:
                 look.color_error,
                 look.sigma,
                 look.outlier,
-                self.options,
+                options,
             )
 
-        parts = mapped(linearised, range(len(self.observations)), self.threads)
+        return mapped(linearised, range(len(self.observations)), self.threads)
+
+    def _linearised(self, look: Look, poses: HandPose, shared: Float[Tensor, "shared"]) -> "_Whole":
+        parts = self._linearised_frames(look, poses, shared, self.options)
         hessian = torch.stack([part.hessian for part in parts])
         gradient = torch.stack([part.gradient for part in parts])
         energies = torch.tensor([part.energy for part in parts])
