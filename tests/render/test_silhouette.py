@@ -13,7 +13,7 @@ from handavatar.hand.open_hand import load_open_hand
 from handavatar.render.rasterize import rasterize
 from handavatar.render.silhouette import (
     WINDOW,
-    _is_covered,
+    _contours,
     outline_points,
     signed_distance,
     silhouette_loss,
@@ -103,13 +103,13 @@ def test_the_outline_is_that_of_the_whole_mesh() -> None:
     assert float(((found - expected)[near].abs() > 0.03).float().mean()) < 0.03
 
 
-@pytest.mark.parametrize("margin", [0, 3])
-def test_points_are_covered_where_any_face_holds_them(margin: int) -> None:
-    generator = torch.Generator().manual_seed(margin)
-    corners = 40 * torch.rand(60, 1, 2, generator=generator) - 5
-    corners = corners + 8 * torch.rand(60, 3, 2, generator=generator)
+@pytest.mark.parametrize("seed", [0, 3])
+def test_points_are_covered_where_any_face_holds_them(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    corners = 40 * torch.rand(60, 1, 2, generator=generator, dtype=torch.float64) - 5
+    corners = corners + 8 * torch.rand(60, 3, 2, generator=generator, dtype=torch.float64)
     corners[7, 1] = math.nan
-    points = 30 * torch.rand(400, 2, generator=generator) - margin
+    points = 30 * torch.rand(400, 2, generator=generator, dtype=torch.float64) - seed
     points[:200] = points[:200] / 6 + 10  # Many in a few pixels, none in most.
     a, b, c = (corners[None, :, index] - points[:, None] for index in range(3))
     crosses = [
@@ -119,9 +119,22 @@ def test_points_are_covered_where_any_face_holds_them(margin: int) -> None:
     sides = torch.stack(crosses).sign()
     expected = (sides.amin(0) >= 0) | (sides.amax(0) <= 0)
     expected = expected & ~corners.isnan().flatten(1).any(1)
-    found = _is_covered(points, corners, margin, 30, 30)
+    pixels, faces = corners.flatten(0, 1), torch.arange(180).reshape(60, 3)
+    found = _contours(pixels, faces).cover(points, pixels)
     assert 20 < int(found.sum()) < 380
     assert torch.equal(found, expected.any(1))
+
+
+def test_of_a_closed_mesh_few_edges_tell_what_is_covered() -> None:
+    posed = load_open_hand().shaped().posed(bent_pose(2))
+    vertices, faces, view = posed.vertices, posed.rig.faces, camera_above(64)
+    pixels = project(view, vertices)[0].double()
+    contours = _contours(pixels, faces)
+    assert len(contours.ends) < len(faces) / 4
+    mask = rasterize(vertices, faces, view).mask
+    row, column = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
+    centers = torch.stack([column, row], dim=-1).double().flatten(0, 1) + 0.5
+    assert torch.equal(contours.cover(centers, pixels).reshape(64, 64), mask)
 
 
 def test_half_coverage_is_the_hard_mask_and_far_pixels_are_sure() -> None:

@@ -3,7 +3,6 @@
 Image positions and distances in pixels, pixel centres at +0.5.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,10 +15,8 @@ from torch.nn.functional import interpolate
 from handavatar.geometry.cameras import Camera, project
 from handavatar.render.rasterize import (
     covered_pixels,
-    holds_in_image,
     is_before_camera,
     numbered_copies,
-    pixel_ranges,
     pixels_in_boxes,
 )
 
@@ -290,39 +287,95 @@ def _outline(
     height: int,
 ) -> _Pieces:
     """The pieces of contours with nothing on one side, as far as the image sees them."""
-    pieces = _split(_contour_edges(pixels, faces), pixels)
-    corners = pieces.corners(pixels)
+    contours = _contours(pixels, faces)
+    pieces = _split(contours.ends, pixels)
+    start, end = pieces.corners(pixels).unbind(1)
     limit = pixels.new_tensor([width, height]) + radius
-    pieces = pieces.chosen(((corners.amax(1) > -radius) & (corners.amin(1) < limit)).all(-1))
+    is_near = (start.maximum(end) > -radius) & (start.minimum(end) < limit)
+    is_near = is_near[:, 0] & is_near[:, 1]
+    pieces, start, end = pieces.chosen(is_near), start[is_near].double(), end[is_near].double()
 
-    start, end = pieces.corners(pixels).double().unbind(1)
     along = torch.nn.functional.normalize(end - start, dim=-1)
     across = _STEP_ACROSS * torch.stack([-along[:, 1], along[:, 0]], dim=-1)
     middle = (start + end) / 2
-    sides = torch.cat([middle + across, middle - across])
-    is_covered = _is_covered(sides, pixels.double()[faces], math.ceil(radius) + 1, width, height)
-    return pieces.chosen(~is_covered.reshape(2, -1).all(0))
+    is_covered = contours.cover(torch.cat([middle + across, middle - across]), pixels.double())
+    first, second = is_covered.chunk(2)
+    return pieces.chosen(~(first & second))
 
 
-def _contour_edges(
-    pixels: Float[Tensor, "vertices 2"], faces: Int[Tensor, "faces 3"]
-) -> Int[Tensor, "edges 2"]:
+@dataclass(frozen=True, eq=False)
+class _Contours:
     """Edges that end the front side or the back side of the mesh as seen in the image.
 
     They contain the outline; the rest of them lies hidden inside it.
+
+    Attributes:
+        ends: the vertices at the two ends.
+        turns: how often the border of the front side runs along the edge from its first end to its
+            second, less how often it runs back; then the same of the back side.
     """
+
+    ends: Int[Tensor, "edges 2"]
+    turns: Int[Tensor, "edges 2"]
+
+    def cover(
+        self, points: Float[Tensor, "points 2"], pixels: Float[Tensor, "vertices 2"]
+    ) -> Bool[Tensor, "points"]:
+        """Whether any face holds the point; a point on an edge may count either way.
+
+        As many faces of one side hold a point as its border winds around it.
+
+        Args:
+            points: in the image.
+            pixels: image positions of the vertices.
+        """
+        if len(points) == 0:
+            return torch.zeros(0, dtype=torch.bool, device=points.device)
+        top = points[:, 1].amin().floor()
+        row = (points[:, 1] - top).floor().long()
+        by_row = row.argsort()
+        num_points = torch.bincount(row)
+        first_point = num_points.cumsum(0) - num_points
+
+        start, end = pixels[self.ends].unbind(1)
+        low, high = (start[:, 1] - top).floor(), (end[:, 1] - top).floor()
+        first = low.minimum(high).clamp(0, len(num_points)).long()
+        last = low.maximum(high).clamp(-1, len(num_points) - 1).long()
+        edge, rank = numbered_copies((last - first + 1).clamp_min(0))
+        crossed = first[edge] + rank
+        copy, rank = numbered_copies(num_points[crossed])
+        point, edge = by_row[first_point[crossed[copy]] + rank], edge[copy]
+
+        height = points[:, 1][point]
+        is_below, is_end_below = start[:, 1][edge] <= height, end[:, 1][edge] <= height
+        is_crossed = is_below != is_end_below
+        point, edge, is_rising = point[is_crossed], edge[is_crossed], is_below[is_crossed]
+        along, away = (end - start)[edge], points[point] - start[edge]
+        turn = along[:, 0] * away[:, 1] - along[:, 1] * away[:, 0]
+        # Whether a ray from the point towards larger x meets the edge, and which way that runs.
+        way = torch.where(is_rising, turn > 0, turn < 0) * torch.where(is_rising, 1, -1)
+        winding = way[:, None] * self.turns[edge]
+        around = winding.new_zeros(len(points), 2).index_add_(0, point, winding)
+        return (around[:, 0] != 0) | (around[:, 1] != 0)
+
+
+def _contours(pixels: Float[Tensor, "vertices 2"], faces: Int[Tensor, "faces 3"]) -> _Contours:
+    """The contours of a mesh in the image."""
     a, b, c = pixels[faces].unbind(1)
     ab, ac = b - a, c - a
     area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
-    ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).sort(dim=-1).values
-    keys, index = torch.unique(ends[:, 0] * len(pixels) + ends[:, 1], return_inverse=True)
-    num_front, num_back = (
-        torch.zeros_like(keys).index_add(0, index, is_side.long().repeat(3))
-        for is_side in (area > 0, area < 0)
+    ends = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    one, other = ends.unbind(1)
+    ways = torch.where(one < other, 1, -1)
+    keys, index = torch.unique(
+        one.minimum(other) * len(pixels) + one.maximum(other), return_inverse=True
     )
-    contour = keys[(num_front == 1) | (num_back == 1)]
-    first = torch.div(contour, len(pixels), rounding_mode="floor")
-    return torch.stack([first, contour - first * len(pixels)], dim=-1)
+    sides = torch.stack([area > 0, area < 0], dim=1).repeat(3, 1)
+    turns = keys.new_zeros(len(keys), 2).index_add_(0, index, ways[:, None] * sides)
+    is_contour = (turns[:, 0] != 0) | (turns[:, 1] != 0)
+    keys = keys[is_contour]
+    first = torch.div(keys, len(pixels), rounding_mode="floor")
+    return _Contours(torch.stack([first, keys - first * len(pixels)], dim=-1), turns[is_contour])
 
 
 def _split(edges: Int[Tensor, "edges 2"], pixels: Float[Tensor, "vertices 2"]) -> _Pieces:
@@ -335,54 +388,6 @@ def _split(edges: Int[Tensor, "edges 2"], pixels: Float[Tensor, "vertices 2"]) -
         number.to(pixels) / count[edge],
         (number + 1).to(pixels) / count[edge],
     )
-
-
-def _is_covered(
-    points: Float[Tensor, "points 2"],
-    corners: Float[Tensor, "faces 3 2"],
-    margin: int,
-    width: int,
-    height: int,
-) -> Bool[Tensor, "points"]:
-    """Whether any face holds the point; points may lie outside the image by the margin.
-
-    Faces meet points through the pixel that both touch.
-    """
-    columns, rows = width + 2 * margin, height + 2 * margin
-    points, corners = points + margin, corners + margin
-    home = points.floor().long().clamp_min(0)
-    home = home[:, 1].clamp_max(rows - 1) * columns + home[:, 0].clamp_max(columns - 1)
-    by_home = home.argsort()
-    num_points = torch.bincount(home, minlength=rows * columns)
-    first_point = num_points.cumsum(0) - num_points
-    covered = torch.zeros(len(points), dtype=torch.bool, device=points.device)
-    lower, upper = corners.amin(1) - 0.5, corners.amax(1) + 0.5
-    is_near = _holds_any(num_points.view(rows, columns), lower, upper)
-    corners, lower, upper = corners[is_near], lower[is_near], upper[is_near]
-    for face, x, y in pixels_in_boxes(lower, upper, columns, rows):
-        pixel = y * columns + x
-        is_met = num_points[pixel] > 0
-        face, pixel = face[is_met], pixel[is_met]
-        pair, rank = numbered_copies(num_points[pixel])
-        point = by_home[first_point[pixel[pair]] + rank]
-        holds = holds_in_image(corners[face[pair]], points[point])
-        covered[point[holds]] = True
-    return covered
-
-
-def _holds_any(
-    counts: Int[Tensor, "height width"],
-    lower: Float[Tensor, "boxes 2"],
-    upper: Float[Tensor, "boxes 2"],
-) -> Bool[Tensor, "boxes"]:
-    """Whether any pixel whose centre lies in the box has a count above zero."""
-    height, width = counts.shape
-    # Entry (y, x): the sum over all pixels above and left of it.
-    sums = torch.nn.functional.pad(counts.cumsum(0).cumsum(1), (1, 0, 1, 0))
-    first, end = pixel_ranges(lower, upper, width, height)
-    (left, top), (right, bottom) = first.T, end.T
-    within = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-    return within > 0
 
 
 def _nearest_pieces(
