@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from made_hands import made_hand
 from scipy import ndimage
 from scipy.special import logsumexp
@@ -12,10 +13,12 @@ from handavatar.capture.masks import (
     find_mask,
     fit_mixture,
     learn_colors,
+    mask_coverage,
     oklab_from_srgb,
     pixels_per_metre,
     settled_border,
 )
+from handavatar.render.silhouette import signed_distance
 
 
 def test_oklab_of_known_colours() -> None:
@@ -102,3 +105,19 @@ def test_scale_is_focal_length_over_depth() -> None:
     hand, _ = made_hand(0)
     # 400 pixels at about half a metre; the hand's own depth range is a few per cent of that.
     assert pixels_per_metre(hand) == pytest.approx(800, rel=0.05)
+
+
+@pytest.mark.parametrize("size", [60, 112])
+def test_a_soft_level_tells_how_far_its_contour_is(size: int) -> None:
+    y, x = np.mgrid[:120, :120] + 0.5
+    height = np.hypot(x - 58.3, y - 61.7) - 40
+    level = 1 / (1 + np.exp(height / 3))  # Falls over a dozen pixels.
+    scale = 120 / size
+    coverage = mask_coverage(level, np.eye(2) * scale, np.zeros(2), size)
+    found = signed_distance(torch.from_numpy(coverage)).numpy()
+    y, x = scale * (np.mgrid[:size, :size] + 0.5)
+    expected = (np.hypot(x - 58.3, y - 61.7) - 40) / scale
+    near = np.abs(expected) < 8
+    error = np.abs(found - expected)[near]
+    assert error.max() < 1.0 and error.mean() < 0.25
+    assert abs((found - expected)[near].mean()) < 0.1

@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.tracking import TrackedHand
-from handavatar.capture.windows import Window
+from handavatar.capture.windows import Window, resampled
 
 _FINGER_CHAINS = (
     (0, 1, 2, 3, 4),
@@ -36,6 +36,9 @@ _HOLE_RADIUS = 0.004
 _CUT_ROUNDS = 1
 SURE = 4.0
 """Logarithm of a ratio of likelihoods from which on colour alone decides."""
+
+SUBPIXELS = 3
+"""Along each side of a pixel, where it is counted how much of it is covered."""
 
 BACKGROUND, HAND, LIKELY_BACKGROUND, LIKELY_HAND = 0, 1, 2, 3
 """GrabCut's labels."""
@@ -290,6 +293,38 @@ def find_mask(hand: TrackedHand, colors: ColorModel) -> HandMask:
     union = (cleaned | reference) & regions.near
     agreement = (cleaned & reference & regions.near).sum() / max(1, int(union.sum()))
     return HandMask(cleaned, level, float(agreement))
+
+
+def mask_coverage(
+    level: Float[np.ndarray, "side side"],
+    window_from_view: Float[np.ndarray, "2 2"],
+    corner: Float[np.ndarray, "2"],
+    size: int,
+) -> Float[np.ndarray, "size size"]:
+    """How much of each pixel of a view is hand, in [0, 1], by the contour of a level at 0.5.
+
+    A level falls over several pixels, so its own values do not say how far the contour is.
+
+    Args:
+        level: of a :class:`HandMask`.
+        window_from_view: turns and scales the view's pixels to those of the mask.
+        corner: the view's upper left corner, pixels of the mask.
+        size: side of the view, pixels.
+    """
+    fine = resampled(grey_picture(level), window_from_view / SUBPIXELS, corner, SUBPIXELS * size)
+    return covered_shares(fine[..., 0] > 127)
+
+
+def covered_shares(fine: Bool[np.ndarray, "fine fine"]) -> Float[np.ndarray, "side side"]:
+    """How much of each pixel is true, in [0, 1], of a mask of ``SUBPIXELS`` times the size."""
+    side = len(fine) // SUBPIXELS
+    return fine.reshape(side, SUBPIXELS, side, SUBPIXELS).mean(axis=(1, 3))
+
+
+def grey_picture(values: np.ndarray) -> UInt8[np.ndarray, "height width 3"]:
+    """Values in [0, 1] as a picture."""
+    grey = (255 * values.astype(np.float32)).round().astype(np.uint8)
+    return np.repeat(grey[..., None], 3, axis=-1)
 
 
 def pixels_per_metre(hand: TrackedHand) -> float:

@@ -14,7 +14,7 @@ from torch import Tensor
 from handavatar.capture.fitted_hand import HandFit
 from handavatar.capture.fitting import Observations
 from handavatar.capture.frames import Capture, Frame
-from handavatar.capture.masks import HandMask
+from handavatar.capture.masks import HandMask, mask_coverage
 from handavatar.capture.tracking import TrackedHand
 from handavatar.capture.windows import window_camera
 from handavatar.fit.energy import LandmarkSightings, Observation
@@ -67,10 +67,11 @@ def observe_hands(
         window = hand.window
         view = window_view(hand, focal)
         side = min(_COMPARED_SIDE, view.width)
+        zoom = np.eye(2) * (view.width / side)
         picture = FramePicture.of(
             view.resized(side, side),
             _smaller(torch.from_numpy(window.image).float() / 255, side),
-            _smaller(torch.from_numpy(mask.level).float()[..., None], side)[..., 0],
+            torch.from_numpy(mask_coverage(mask.level, zoom, np.zeros(2), side)).float(),
             _smaller(torch.from_numpy(is_known).float()[..., None], side)[..., 0] > 0.999,
             torch.from_numpy(gains[number]).float(),
         )

@@ -36,10 +36,14 @@ from handavatar.capture.guided_masks import (
     wrist_line,
 )
 from handavatar.capture.masks import (
+    SUBPIXELS,
     HandMask,
+    covered_shares,
     find_mask,
+    grey_picture,
     inside_picture,
     learn_colors,
+    mask_coverage,
     pixels_per_metre,
 )
 from handavatar.capture.outlines import silhouette
@@ -75,7 +79,6 @@ Progress = Callable[[float, str], None]
 _BOX_SCALE = 1.3
 _WRIST_MARGIN = 0.008
 """Metres before the rig's end from where on masks are believed."""
-_SUBPIXELS = 3
 _HELD_OUT = ((0.28, 0.08), (0.68, 0.08))
 _MIN_KEPT = 8
 _SEEN_SHARE = 0.9
@@ -478,16 +481,13 @@ def _result(
     )
     zoom = np.eye(2) * (box / size)
     image = resampled(window.image, zoom, np.array(corner), size).copy()
-    fine = resampled(
-        _grey(guided.mask.level), zoom / _SUBPIXELS, np.array(corner), _SUBPIXELS * size
-    )
-    shares = _shares(fine[..., 0] > 127)
-    known = resampled(_grey(guided.known), zoom, np.array(corner), size)[..., 0] == 255
+    shares = mask_coverage(guided.mask.level, zoom, np.array(corner), size)
+    known = resampled(grey_picture(guided.known), zoom, np.array(corner), size)[..., 0] == 255
     was_seen = _is_in_view(window, corner, box, size)
     image[~was_seen] = 128
 
-    fine_camera = camera.resized(_SUBPIXELS * size, _SUBPIXELS * size)
-    mesh = _shares(silhouette(rig, vertices, fine_camera))
+    fine_camera = camera.resized(SUBPIXELS * size, SUBPIXELS * size)
+    mesh = covered_shares(silhouette(rig, vertices, fine_camera))
     in_crop = project(camera, vertices)[0].double().numpy()
     line = wrist_line(in_crop[rim], in_crop.mean(0))
     scale = camera.focal[0] / max(float(vertices[:, 2].median()), 0.02)
@@ -519,12 +519,6 @@ def _result(
     return FittedFrame(
         frame, mesh > 0.5, iou, error * scale, guided.edge_quality, outside, unknown, reason
     )
-
-
-def _grey(values: np.ndarray) -> np.ndarray:
-    """Values in [0, 1] as a picture."""
-    grey = (255 * values.astype(np.float32)).round().astype(np.uint8)
-    return np.repeat(grey[..., None], 3, axis=-1)
 
 
 def _is_in_view(
@@ -568,12 +562,6 @@ def _missing(
     pixel = pixel.clip(0, len(guided.known) - 1)
     is_unknown = is_far | ~guided.known[pixel[:, 1], pixel[:, 0]]
     return float(is_outside.mean()), float((is_unknown & ~is_outside).mean())
-
-
-def _shares(fine: Bool[np.ndarray, "fine fine"]) -> Float[np.ndarray, "side side"]:
-    """How much of each pixel is true, in [0, 1], of a mask of ``_SUBPIXELS`` times the size."""
-    side = len(fine) // _SUBPIXELS
-    return fine.reshape(side, _SUBPIXELS, side, _SUBPIXELS).mean(axis=(1, 3))
 
 
 def _confidence(
