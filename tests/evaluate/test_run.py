@@ -188,7 +188,7 @@ def test_tracked_poses_are_fitted_to_masks_and_known_ones_are_not(
         hands: list[ShapedHand], frames: list[Frame], options: RegisterOptions, learns_shape: bool
     ) -> list[HandPose]:
         # By landmarks and masks, never by colours, and with the avatar's own shape.
-        assert options.color_sigmas == () and not learns_shape
+        assert options.texture_sigmas == () and not learns_shape
         assert len(hands) == len(frames)
         seen.append(frames)
         return [frame.pose for frame in frames]

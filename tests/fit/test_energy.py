@@ -9,14 +9,13 @@ from made_frames import (
     camera_over,
     draw,
     observed,
-    painted,
     points_on,
     pose_at,
     scribble,
     spoilt,
 )
 
-from handavatar.fit.appearance import SkinColors
+from handavatar.fit.appearance import SkinTexture, fit_texture, see_texture
 from handavatar.fit.energy import (
     EnergyOptions,
     HandPoints,
@@ -35,16 +34,19 @@ from handavatar.hand.rig import Rig
 
 FAR = 1e4
 """An outlier at so many pixels or standard deviations is none: the energy is a sum of squares."""
-SQUARES = EnergyOptions(color_outlier=FAR, landmark_outlier=FAR)
+SQUARES = EnergyOptions(texture_outlier=FAR, landmark_outlier=FAR)
 SIZE = 128
 
 
-def _paint(points: HandPoints) -> SkinColors:
-    """The true paint under a light that is the same everywhere."""
-    light = torch.zeros(9, 3)
-    light[0] = 1.0
-    albedo = points.surface.positions(painted(points.hand.rig))
-    return SkinColors(albedo, light, torch.ones(len(albedo)))
+def _texture(
+    points: HandPoints, pose: HandPose, seen: Observation, sigma: float = 2.0
+) -> SkinTexture:
+    """What a frame shows of the skin, in its true pose."""
+    vertices = points.hand.posed(pose).vertices
+    picture, rig = seen.picture, points.hand.rig
+    shown = see_texture(rig, vertices, points.surface, picture, picture.band(sigma))
+    found, _ = fit_texture(3 * [shown], len(points.surface.faces))
+    return found
 
 
 def _linearised(
@@ -52,12 +54,12 @@ def _linearised(
     pose: HandPose,
     seen: Observation,
     options: EnergyOptions,
-    colors: SkinColors | None = None,
+    texture: SkinTexture | None = None,
     sigma: float = 2.0,
     outlier: float = FAR,
 ) -> Linearised:
-    blurred = seen.picture.blurred(sigma)
-    return linearise_frame(points, pose, seen, blurred, colors, 0.05, sigma, outlier, options)
+    band = seen.picture.band(sigma)
+    return linearise_frame(points, pose, seen, band, texture, 0.05, sigma, outlier, options)
 
 
 def _slopes(
@@ -67,7 +69,7 @@ def _slopes(
     options: EnergyOptions,
     unknowns: list[int],
     step: float,
-    colors: SkinColors | None = None,
+    texture: SkinTexture | None = None,
 ) -> torch.Tensor:
     found = []
     for unknown in unknowns:
@@ -77,7 +79,7 @@ def _slopes(
             # Shifts in steps a tenth as long: turns move fingertips by a tenth of a metre each.
             change[unknown] = sign * step * (0.1 if unknown >= 48 else 1)
             at = moved_pose(pose, change)
-            ends.append(_linearised(points, at, seen, options, colors).energy)
+            ends.append(_linearised(points, at, seen, options, texture).energy)
         found.append((ends[0] - ends[1]) / (2 * step * (0.1 if unknown >= 48 else 1)))
     return torch.tensor(found)
 
@@ -157,16 +159,16 @@ def test_the_slope_of_outlines(rig: Rig) -> None:
     assert cosine > 0.99 and 0.95 < ratio < 1.05
 
 
-def test_the_slope_of_colours(rig: Rig) -> None:
+def test_the_slope_of_the_texture(rig: Rig) -> None:
     camera = camera_over(SIZE)
     truth = calm_poses(rig, 1)
     seen = observed(rig.shaped(), pose_at(truth, 0), camera)
     points = points_on(rig.shaped(), count=3000)
     pose = pose_at(spoilt(truth, 2.0), 0)
     options = replace(SQUARES, outline_points=0.0)
-    colors = _paint(points)
-    found = _linearised(points, pose, seen, options, colors)
-    slopes = _slopes(points, pose, seen, options, SEEN_WELL, 4e-3, colors)
+    texture = _texture(points, pose_at(truth, 0), seen)
+    found = _linearised(points, pose, seen, options, texture)
+    slopes = _slopes(points, pose, seen, options, SEEN_WELL, 4e-3, texture)
     cosine, ratio = _close(found.gradient[SEEN_WELL], slopes)
     # Differences leave out that other points come into view, and that the picture is blurred by
     # two pixels and the paint is not; measured 0.91 and 0.87.
@@ -208,15 +210,16 @@ def test_unknown_pixels_say_nothing(rig: Rig) -> None:
     known[:40] = False
     pose = pose_at(spoilt(truth, 3.0), 0)
     points = points_on(rig.shaped())
+    texture = _texture(points, pose_at(truth, 0), observed(rig.shaped(), pose_at(truth, 0), camera))
     both = []
     for shown in ((color, coverage), scribble(color, coverage, known)):
         picture = FramePicture.of(camera, *shown, known, torch.ones(3))
         seen = Observation(picture, 0.0)
-        both.append(_linearised(points, pose, seen, EnergyOptions(), _paint(points), outlier=3.0))
+        both.append(_linearised(points, pose, seen, EnergyOptions(), texture, outlier=3.0))
     assert both[0].energy == both[1].energy > 1
     assert torch.equal(both[0].gradient, both[1].gradient)
     assert torch.equal(both[0].hessian, both[1].hessian)
     nothing = FramePicture.of(camera, color, coverage, torch.zeros_like(known), torch.ones(3))
     seen = Observation(nothing, 0.0)
-    empty = _linearised(points, pose, seen, EnergyOptions(), _paint(points), outlier=3.0)
+    empty = _linearised(points, pose, seen, EnergyOptions(), texture, outlier=3.0)
     assert empty.energy == 0 and not empty.gradient.any() and not empty.hessian.any()

@@ -107,15 +107,24 @@ def test_no_border_runs_along_what_is_unknown_or_beyond() -> None:
     assert picture.is_known(points).tolist() == [True, False, False, False]
 
 
-def test_colours_are_blurred_among_the_hands_own_and_at_the_common_exposure() -> None:
+def test_a_band_has_details_of_its_size_and_nothing_of_the_background() -> None:
     coverage = _disc((32.0, 32.0), 20.0)
-    color = torch.where(coverage[..., None] > 0, torch.tensor([0.6, 0.5, 0.4]), torch.ones(3))
+    plain = torch.tensor([0.6, 0.5, 0.4])
+    x = torch.arange(SIZE) + 0.5
     known, gain = torch.ones_like(coverage, dtype=torch.bool), torch.tensor([1.2, 1.0, 0.8])
-    picture = FramePicture.of(_camera(), color, coverage, known, gain)
     inside = torch.tensor([[32.0, 32.0], [46.0, 40.0], [32.0, 14.5]])
-    values, _ = picture.blurred(3.0).sample(inside)
-    expected = torch.tensor([0.5, 0.5, 0.5]).expand(3, 3)
-    torch.testing.assert_close(values[:, :3], expected, rtol=0, atol=1e-5)
+    strengths = []
+    for wavelength in (10.0, 200.0):
+        waves = 1 + 0.2 * torch.sin(2 * torch.pi / wavelength * x)[None, :, None]
+        color = torch.where(coverage[..., None] > 0, plain * waves, torch.ones(3))
+        picture = FramePicture.of(_camera(), color, coverage, known, gain)
+        channels = picture.band(1.5).channels[:3, picture.hand]
+        strengths.append(float(channels.std()))
+    assert strengths[0] > 0.06 and strengths[1] < 0.02
+    color = torch.where(coverage[..., None] > 0, plain, torch.ones(3))
+    picture = FramePicture.of(_camera(), color, coverage, known, gain)
+    values, _ = picture.band(3.0).sample(inside)
+    torch.testing.assert_close(values[:, :3], torch.zeros(3, 3), rtol=0, atol=1e-5)
 
 
 def test_scribbling_over_the_unknown_changes_no_bit(rig: Rig) -> None:
@@ -127,8 +136,8 @@ def test_scribbling_over_the_unknown_changes_no_bit(rig: Rig) -> None:
     both = []
     for shown in ((color, coverage), scribble(color, coverage, known)):
         picture = FramePicture.of(camera, *shown, known, torch.tensor([1.1, 1.0, 0.9]))
-        blurred = [picture.blurred(sigma).channels for sigma in (0.7, 3.0)]
-        parts = [picture.distance, picture.border, picture.border_normals, *blurred]
+        bands = [picture.band(sigma).channels for sigma in (0.7, 3.0)]
+        parts = [picture.distance, picture.border, picture.border_normals, *bands]
         both.append([*parts, picture.hand, picture.has_outline, picture.known])
     assert len(both[0][1]) > 50
     assert all(torch.equal(first, second) for first, second in zip(*both, strict=True))

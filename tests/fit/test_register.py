@@ -21,7 +21,7 @@ from handavatar.fit.register import Registered, RegisterOptions, register
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import Rig
 
-QUICK = RegisterOptions(restarts=0, color_sigmas=(3.0,), color_rounds=1)
+QUICK = RegisterOptions(restarts=0, texture_sigmas=(3.0,), texture_rounds=1)
 """One pass of every stage."""
 
 
@@ -56,7 +56,7 @@ def _registered(
 
 
 def _parts(found: Registered) -> list[torch.Tensor]:
-    assert found.colors is not None
+    assert found.texture is not None
     return [
         found.poses.rotations,
         found.poses.translation,
@@ -65,8 +65,8 @@ def _parts(found: Registered) -> list[torch.Tensor]:
         found.shape_change,
         found.hand.rest_vertices,
         found.energies,
-        found.colors.albedo,
-        found.colors.light,
+        found.texture.values,
+        found.texture.trust,
     ]
 
 
@@ -86,7 +86,7 @@ def test_the_short_way_comes_nearer_too(rig: Rig, short: Clip) -> None:
 def test_the_same_input_gives_the_same_bits(rig: Rig, short: Clip) -> None:
     """Twice, and however many threads share the frames."""
     tracked = spoilt(short.truth, 5.0)
-    options = RegisterOptions(restarts=1, color_sigmas=(1.5,), color_rounds=1)
+    options = RegisterOptions(restarts=1, texture_sigmas=(1.5,), texture_rounds=1)
     threads = torch.get_num_threads()
     results = []
     try:

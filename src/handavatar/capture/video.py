@@ -64,6 +64,7 @@ from handavatar.capture.tracking import (
     track_hand,
 )
 from handavatar.capture.windows import Window, resampled, window_camera
+from handavatar.fit.energy import EnergyOptions
 from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.cameras import project
 from handavatar.hand.rig import Rig
@@ -124,10 +125,14 @@ class VideoOptions:
     """How the hand is first fitted, to landmarks alone."""
     register: RegisterOptions = field(
         default_factory=lambda: RegisterOptions(
-            coefficient_sigma=1.0, tilts=(25.0,), restarts=1, color_rounds=1
+            coefficient_sigma=1.0,
+            tilts=(25.0,),
+            restarts=1,
+            texture_rounds=2,
+            energy=EnergyOptions(texture_share=2.0),
         )
     )
-    """How the hand is laid onto masks and colours."""
+    """How the hand is laid onto masks and texture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -308,7 +313,7 @@ def _laid_on(
             _known_before_wrist(track, fitted, rig),
             gains,
             rig,
-            replace(options.register, color_sigmas=(), restarts=0),
+            replace(options.register, texture_sigmas=(), restarts=0),
             lambda share: report(0.55 + 0.15 * share, "laying the hand onto the masks"),
         )
         guided = _guided_masks(track, fitted, rig, gains, report)
@@ -321,7 +326,7 @@ def _laid_on(
             gains,
             rig,
             replace(options.register, is_wide=False),
-            lambda share: report(0.75 + 0.15 * share, "laying the hand onto masks and colours"),
+            lambda share: report(0.75 + 0.15 * share, "laying the hand onto masks and texture"),
         )
     except CaptureError as error:
         raise _failure(options, error.what, error.remedy, track, []) from error

@@ -159,7 +159,7 @@ def held_out_poses(avatar: HandAvatar, frames: list[Frame]) -> list[HandPose]:
     options = RegisterOptions(
         pose_error=float(avatar.info.get("pose_error", RegisterOptions.pose_error)),
         learns_pose_error=False,
-        color_sigmas=(),
+        texture_sigmas=(),
     )
     found = register_frames(hands, frames, options, learns_shape=False)
     return [pose.to(avatar.device) for pose in registered_poses(found)]

@@ -1,7 +1,7 @@
 """The one energy of a hand laid onto a picture, linearised: what each observation says of a pose.
 
 Every term is a weighted sum of squared residuals in units of their expected error. Points of an
-outline, and colours of neighbouring points, err together: a term's weight is the number of
+outline, and details of neighbouring points, err together: a term's weight is the number of
 independent observations it stands for, however many points it is evaluated at.
 """
 
@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from handavatar.fit.appearance import SkinColors, see_points
+from handavatar.fit.appearance import SkinTexture, see_points
 from handavatar.fit.kinematics import (
     NUM_UNKNOWNS,
     RestPoints,
@@ -22,13 +22,16 @@ from handavatar.fit.kinematics import (
     pixel_jacobian,
     rest_with_pose,
 )
-from handavatar.fit.pictures import BlurredPicture, FramePicture, drawing_camera
+from handavatar.fit.pictures import FramePicture, PictureBand, drawing_camera
 from handavatar.fit.shape import ShapeSpace
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import ShapedHand
 from handavatar.render.silhouette import OutlinePoints, outline_points
+
+_LEAST_TRUST = 0.5
+"""Views from the front by which a point's texture is known."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +46,10 @@ class EnergyOptions:
     """Independent points of an outline, each way."""
     turn_cost: float = 8.0
     """Pixels that a point of the mask's outline goes rather than turn its normal by a radian."""
-    color_outlier: float = 3.5
-    """Standard deviations beyond which a colour has other causes."""
-    color_share: float = 0.3
-    """Independent colours per blurred pixel of the hand: light errs alike over many."""
+    texture_outlier: float = 3.5
+    """Standard deviations beyond which a detail has other causes: a shadow's edge, a fold."""
+    texture_share: float = 0.5
+    """Weight of the details that a picture of the hand has room for, each of a blurred pixel."""
     landmark_outlier: float = 3.0
     """Standard deviations beyond which a landmark is misplaced."""
 
@@ -90,7 +93,7 @@ class Linearised:
     Attributes:
         hessian: Gauss and Newton's, of 51 unknowns of the pose and then the shared ones.
         gradient: half of the energy's.
-        energy: of the outlines, the colours and the landmarks.
+        energy: of the outlines, the texture and the landmarks.
     """
 
     hessian: Float[Tensor, "unknowns unknowns"]
@@ -125,23 +128,23 @@ def linearise_frame(
     points: HandPoints,
     pose: HandPose,
     seen: Observation,
-    blurred: BlurredPicture,
-    colors: SkinColors | None,
-    color_error: float,
+    band: PictureBand,
+    texture: SkinTexture | None,
+    texture_error: float,
     sigma: float,
     outlier: float,
     options: EnergyOptions,
 ) -> Linearised:
-    """What outlines, colours and landmarks of one frame say.
+    """What outlines, texture and landmarks of one frame say.
 
     Args:
         points: the hand.
         pose: where.
         seen: of the frame.
-        blurred: the frame's picture.
-        colors: of the surface's points; None leaves the colours out.
-        color_error: expected error of a colour, in [0, 1].
-        sigma: of the blur, pixels.
+        band: of the frame's picture.
+        texture: of the surface's points; None leaves it out.
+        texture_error: expected, of one channel.
+        sigma: of the band's blur, pixels.
         outlier: pixels (of 256) at which an outline loses its pull.
         options: expected errors.
     """
@@ -154,18 +157,18 @@ def linearise_frame(
     )
     total = _Sum(NUM_UNKNOWNS + points.num_shared)
     if options.outline_points > 0:
-        _add_outlines(total, points, hand, skeleton, vertices, seen, blurred, outlier, options)
-    if colors is not None:
-        _add_colors(
+        _add_outlines(total, points, hand, skeleton, vertices, seen, band, outlier, options)
+    if texture is not None:
+        _add_texture(
             total,
             points,
             hand,
             skeleton,
             vertices,
             seen.picture,
-            blurred,
-            colors,
-            color_error,
+            band,
+            texture,
+            texture_error,
             sigma,
             options,
         )
@@ -215,7 +218,7 @@ def _add_outlines(
     skeleton: Skeleton,
     vertices: Float[Tensor, "vertices 3"],
     seen: Observation,
-    blurred: BlurredPicture,
+    band: PictureBand,
     outlier: float,
     options: EnergyOptions,
 ) -> None:
@@ -230,7 +233,7 @@ def _add_outlines(
     rest = _outline_rest(points, hand, outline)
     positions = skeleton.positions(rest)
     pixels, _, moving = pixel_jacobian(camera, positions)
-    values, slopes = blurred.sample(pixels)
+    values, slopes = band.sample(pixels)
     is_known = picture.sees_outline(pixels)
     moving = moving @ skeleton.jacobian(rest)
     weights = outline.lengths * is_known
@@ -276,35 +279,34 @@ def surface_rest(
     )
 
 
-def _add_colors(
+def _add_texture(
     total: _Sum,
     points: HandPoints,
     hand: ShapedHand,
     skeleton: Skeleton,
     vertices: Float[Tensor, "vertices 3"],
     picture: FramePicture,
-    blurred: BlurredPicture,
-    colors: SkinColors,
-    color_error: float,
+    band: PictureBand,
+    texture: SkinTexture,
+    texture_error: float,
     sigma: float,
     options: EnergyOptions,
 ) -> None:
-    """Visible points that face the camera, inside the mask, have the colour that others saw."""
+    """Visible points that face the camera, inside the mask, show what they show in others."""
     camera = picture.camera
     seen = see_points(hand.rig, vertices, points.surface, camera)
-    values, slopes = blurred.sample(seen.pixels)
-    is_compared = seen.is_visible & (values[:, 3] < -1) & (colors.trust > 0.5)
+    values, slopes = band.sample(seen.pixels)
+    is_compared = seen.is_visible & (values[:, 3] < -1) & (texture.trust > _LEAST_TRUST)
     index = (is_compared & picture.is_known(seen.pixels)).nonzero()[:, 0]
     if len(index) < 10:
         return
-    expected = colors.select(index).colors(seen.normals[index])
-    residuals = (values[index, :3] - expected) / color_error
+    residuals = (values[index, :3] - texture.values[index]) / texture_error
     rest = surface_rest(points, hand, index)
     _, _, moving = pixel_jacobian(camera, skeleton.positions(rest))
     moving = moving @ skeleton.jacobian(rest)
-    jacobian = (slopes[index, :3] @ moving / color_error).flatten(0, 1)
+    jacobian = (slopes[index, :3] @ moving / texture_error).flatten(0, 1)
     blur_area = 4 * math.pi * (sigma**2 + 0.5)
-    count = options.color_share * float(picture.hand.sum()) / blur_area
+    count = options.texture_share * float(picture.hand.sum()) / blur_area
     weights = seen.facing[index]
     weights = weights * (count / weights.sum())
     distance = residuals.norm(dim=-1, keepdim=True).expand(-1, 3)
@@ -312,7 +314,7 @@ def _add_colors(
         residuals.flatten(),
         jacobian,
         weights[:, None].expand(-1, 3).flatten(),
-        options.color_outlier,
+        options.texture_outlier,
         distance.flatten(),
     )
 

@@ -1,4 +1,4 @@
-"""What one frame shows, ready to be compared with: blurred colours, the distance to the outline."""
+"""What one frame shows, ready to be compared with: details of colour, distance to the outline."""
 
 from dataclasses import dataclass
 
@@ -15,6 +15,12 @@ from handavatar.render.silhouette import known_distance
 _MOST_BORDER_POINTS = 240
 _DRAWN_SIDE = 144
 """Pixels: 1 to 2 mm each on a hand."""
+_BAND_RATIO = 2.5
+"""Of the two blurs of a band."""
+_DARKEST = 0.02
+"""Of colours in [0, 1]: noise has more to say in darker ones."""
+_LEAST_SHARE = 0.03
+"""Of the hand's pixels under a blur."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,18 +80,30 @@ class FramePicture:
         """Whether the outline that is nearest to these points was seen."""
         return _holds(self.has_outline, pixels)
 
-    def blurred(self, sigma: float) -> "BlurredPicture":
-        """Colours blurred among the hand's own pixels, so that no background leaks in."""
+    def band(self, sigma: float) -> "PictureBand":
+        """Details of about one size: the colours' logarithm blurred, less the same blurred more.
+
+        Both among the hand's own pixels, so that no background leaks in.
+
+        Args:
+            sigma: of the finer blur, pixels.
+        """
         weight = self.hand.to(self.color)[..., None]
-        total = blur(torch.cat([self.color * weight, weight], dim=-1), sigma)
-        share = total[..., 3:]
-        color = torch.where(share > 0.05, total[..., :3] / share.clamp_min(0.05), 0.0)
-        return BlurredPicture(torch.cat([color, self.distance[..., None]], -1).permute(2, 0, 1))
+        values = torch.cat([self.color.clamp_min(_DARKEST).log() * weight, weight], dim=-1)
+        fine, coarse = (_mean_of(blur(values, each)) for each in (sigma, _BAND_RATIO * sigma))
+        return PictureBand(
+            torch.cat([fine - coarse, self.distance[..., None]], -1).permute(2, 0, 1)
+        )
+
+
+def _mean_of(total: Float[Tensor, "height width 4"]) -> Float[Tensor, "height width 3"]:
+    share = total[..., 3:]
+    return torch.where(share > _LEAST_SHARE, total[..., :3] / share.clamp_min(_LEAST_SHARE), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
-class BlurredPicture:
-    """Channels to be read between the pixels: three colours and the distance to the outline."""
+class PictureBand:
+    """Channels to be read between the pixels: three of details, and the distance to the outline."""
 
     channels: Float[Tensor, "4 height width"]
 

@@ -2,7 +2,7 @@
 
 First the outlines decide, from wide to narrow; frames that they explain badly are begun again from
 other poses. Then the shape shares the blame, and how far the tracked poses are off is learned from
-how far they had to move. Colours come last, when the start is not spoilt, from coarse to fine.
+how far they had to move. The texture comes last, when the start is not spoilt, from coarse to fine.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from handavatar.fit.appearance import SkinColors, fit_colors
+from handavatar.fit.appearance import SkinTexture, fit_texture
 from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
 from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, moved_pose, pose_difference
 from handavatar.fit.landmarks import landmark_rest, offset_tolerances
@@ -40,7 +40,8 @@ _FINE = 0.7
 """Pixels of blur while outlines alone are looked at."""
 _BAD = 1.3
 """Times the median energy: such frames are begun again."""
-_LEAST_COLOR_ERROR = 0.012
+_LEAST_TEXTURE_ERROR = 0.01
+"""Of logarithms of colours: a step of eight bits, and a little noise."""
 _MILLIMETRES_PER_DEGREE = 0.5
 """A tracker that is off by some degrees is off by as many half millimetres, each way."""
 _LEAST_ERROR, _MOST_ERROR = 0.5, 12.0
@@ -62,10 +63,10 @@ class RegisterOptions:
     a hand that leans back from one that bends forward."""
     restarts: int = 4
     """Times that badly explained frames are begun anew."""
-    color_sigmas: tuple[float, ...] = (3.0, 1.5)
-    """Blur of the pictures whose colours are compared, pixels of 256."""
-    color_rounds: int = 3
-    """Turns of colours and poses at each."""
+    texture_sigmas: tuple[float, ...] = (5.0, 2.5, 1.2)
+    """Size of the details that are compared, pixels of 256."""
+    texture_rounds: int = 4
+    """Turns of texture and poses at each."""
     coefficient_sigma: float = 0.5
     """Standard deviations by which the shape coefficients may be off."""
     seed: int = 0
@@ -89,7 +90,7 @@ class Registered:
             and colours: an inverse covariance.
         energies: how badly each frame is explained; a good one has about as many as the best.
         pose_error: degrees by which the tracked poses were off, as learned.
-        colors: of the surface's points, if they were looked at.
+        texture: of the surface's points in the finest band, if it was looked at.
     """
 
     poses: HandPose
@@ -100,7 +101,7 @@ class Registered:
     information: Float[Tensor, "frames 51 51"]
     energies: Float[Tensor, "frames"]
     pose_error: float
-    colors: SkinColors | None
+    texture: SkinTexture | None
 
 
 @torch.no_grad()
@@ -216,16 +217,15 @@ def _register(
             descent.step_shape(Look(_FINE, _NARROW), 2)
             descent.step_poses(Look(_FINE, _NARROW), 2)
     report(0.55)
-    look, colors = Look(_FINE, _NARROW), None
+    look = Look(_FINE, _NARROW)
     width = observations[0].picture.camera.width / 256
-    for number, sigma in enumerate(options.color_sigmas):
-        descent.forget_blurred(look.sigma)
-        for turn in range(options.color_rounds):
-            look = colored_look(descent, sigma * width)
-            colors = look.colors
+    for number, sigma in enumerate(options.texture_sigmas):
+        descent.forget_bands(look.sigma)
+        for turn in range(options.texture_rounds):
+            look = textured_look(descent, sigma * width)
             descent.step_poses(look, 2)
-            done = number + (turn + 1) / options.color_rounds
-            report(0.55 + 0.45 * done / len(options.color_sigmas))
+            done = number + (turn + 1) / options.texture_rounds
+            report(0.55 + 0.45 * done / len(options.texture_sigmas))
     energies, covariances = descent.judge(look)
     return Registered(
         descent.poses,
@@ -236,7 +236,7 @@ def _register(
         descent.tracked_information(),
         energies,
         error,
-        colors,
+        look.texture,
     )
 
 
@@ -247,12 +247,12 @@ def _compared_points(rig: Rig) -> SurfacePoints:
     return sample_surface_evenly(rig.template_vertices, rig.faces, _NUM_POINTS, generator)
 
 
-def colored_look(descent: Descent, sigma: float) -> Look:
-    """A look at colours, as all frames together show them at present."""
+def textured_look(descent: Descent, sigma: float) -> Look:
+    """A look at the skin's texture, as all frames together show it at present."""
     look = Look(sigma, _NARROW)
     num_points = len(descent.points_of(descent.shared, 0).surface.faces)
-    colors, error = fit_colors(descent.see(look), num_points)
-    return replace(look, colors=colors, color_error=max(error, _LEAST_COLOR_ERROR))
+    texture, error = fit_texture(descent.see(look), num_points)
+    return replace(look, texture=texture, texture_error=max(error, _LEAST_TEXTURE_ERROR))
 
 
 def begin_anew(descent: Descent, look: Look, generator: torch.Generator, is_near: bool) -> None:

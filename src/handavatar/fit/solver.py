@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from handavatar.fit.appearance import SeenColors, SkinColors, see_colors
+from handavatar.fit.appearance import SeenTexture, SkinTexture, see_texture
 from handavatar.fit.energy import (
     EnergyOptions,
     HandPoints,
@@ -22,7 +22,7 @@ from handavatar.fit.energy import (
 from handavatar.fit.habits import habit_residuals
 from handavatar.fit.kinematics import NUM_UNKNOWNS, moved_pose, pose_difference
 from handavatar.fit.motion import MotionTerms, motion_terms, solve_chain
-from handavatar.fit.pictures import BlurredPicture
+from handavatar.fit.pictures import PictureBand
 from handavatar.hand.pose import HandPose
 from handavatar.jobs.threads import mapped
 
@@ -37,16 +37,16 @@ class Look:
     """How frames are looked at in one stage.
 
     Attributes:
-        sigma: blur of the pictures, pixels.
+        sigma: of the pictures' band, pixels.
         outlier: at which an outline loses its pull, pixels of 256.
-        colors: to compare with; None leaves colours out.
-        color_error: expected, of a channel in [0, 1].
+        texture: to compare with; None leaves it out.
+        texture_error: expected, of one channel.
     """
 
     sigma: float
     outlier: float
-    colors: SkinColors | None = None
-    color_error: float = 1.0
+    texture: SkinTexture | None = None
+    texture_error: float = 1.0
 
 
 _BLIND = Look(0.7, 1.0)
@@ -84,7 +84,7 @@ class Descent:
     threads: int
     damping: Float[Tensor, "frames"] = field(init=False)
     shared_damping: float = 1e-2
-    _blurred: dict[tuple[int, float], BlurredPicture] = field(default_factory=dict)
+    _bands: dict[tuple[int, float], PictureBand] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Begins with little damping."""
@@ -103,33 +103,33 @@ class Descent:
             poses=_at(self.poses, frames),
             points_of=lambda shared, place: self.points_of(shared, numbers[place]),
         )
-        selected._blurred = {}
+        selected._bands = {}
         for place, number in enumerate(numbers):
-            for (frame, sigma), picture in self._blurred.items():
+            for (frame, sigma), picture in self._bands.items():
                 if frame == number:
-                    selected._blurred[place, sigma] = picture
+                    selected._bands[place, sigma] = picture
         return selected
 
-    def blurred(self, frame: int, sigma: float) -> BlurredPicture:
-        """A frame's picture, blurred; kept."""
+    def band(self, frame: int, sigma: float) -> PictureBand:
+        """A band of a frame's picture; kept."""
         key = (frame, sigma)
-        if key not in self._blurred:
-            self._blurred[key] = self.observations[frame].picture.blurred(sigma)
-        return self._blurred[key]
+        if key not in self._bands:
+            self._bands[key] = self.observations[frame].picture.band(sigma)
+        return self._bands[key]
 
-    def forget_blurred(self, sigma: float) -> None:
-        """Frees the pictures of one blur."""
-        self._blurred = {key: value for key, value in self._blurred.items() if key[1] != sigma}
+    def forget_bands(self, sigma: float) -> None:
+        """Frees what belongs to one blur."""
+        self._bands = {key: value for key, value in self._bands.items() if key[1] != sigma}
 
-    def see(self, look: Look) -> list[SeenColors]:
-        """The colours that every frame shows, with the poses as they are."""
+    def see(self, look: Look) -> list[SeenTexture]:
+        """The texture that every frame shows, with the poses as they are."""
 
-        def seen(frame: int) -> SeenColors:
+        def seen(frame: int) -> SeenTexture:
             points = self.points_of(self.shared, frame)
             vertices = points.hand.posed(_at(self.poses, frame)).vertices
             picture = self.observations[frame].picture
-            blurred = self.blurred(frame, look.sigma)
-            return see_colors(points.hand.rig, vertices, points.surface, picture, blurred)
+            band = self.band(frame, look.sigma)
+            return see_texture(points.hand.rig, vertices, points.surface, picture, band)
 
         return mapped(seen, range(len(self.observations)), self.threads)
 
@@ -211,9 +211,9 @@ class Descent:
                 self.points_of(shared, frame),
                 _at(poses, frame),
                 self.observations[frame],
-                self.blurred(frame, look.sigma),
-                look.colors,
-                look.color_error,
+                self.band(frame, look.sigma),
+                look.texture,
+                look.texture_error,
                 look.sigma,
                 look.outlier,
                 options,
