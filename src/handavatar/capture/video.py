@@ -313,7 +313,7 @@ def _laid_on(
             _known_before_wrist(track, fitted, rig),
             gains,
             rig,
-            replace(options.register, texture_sigmas=(), restarts=0),
+            replace(options.register, texture_sigmas=()),
             lambda share: report(0.55 + 0.15 * share, "laying the hand onto the masks"),
         )
         guided = _guided_masks(track, fitted, rig, gains, report)
@@ -325,7 +325,7 @@ def _laid_on(
             [first & mask.known for first, mask in zip(before, guided, strict=True)],
             gains,
             rig,
-            replace(options.register, is_wide=False),
+            replace(options.register, is_wide=False, tilts=(), restarts=0),
             lambda share: report(0.75 + 0.15 * share, "laying the hand onto masks and texture"),
         )
     except CaptureError as error:

@@ -1,6 +1,7 @@
 """Poses and shape of a tracked capture, laid onto its frames before anything is learned."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 
@@ -14,6 +15,7 @@ from handavatar.train.corrections import PoseCorrections
 
 _SHAPE_STEPS = 300
 _SHAPE_RATE = 3e-3
+_FEW_RESTARTS = 1
 
 
 def register_training(
@@ -32,6 +34,9 @@ def register_training(
         options: expected errors, rounds.
         progress: told how far it is.
     """
+    if all(frame.covariance is not None for frame in frames):
+        # Whoever knows these has looked for other poses already.
+        options = replace(options, restarts=min(options.restarts, _FEW_RESTARTS))
     rig = avatar.coarse_rig.to("cpu")
     hand = rig.shaped(avatar.coefficients.cpu())
     found = register_frames([hand], frames, options, progress=progress)
