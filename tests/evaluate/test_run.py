@@ -74,7 +74,10 @@ def judged(
 ) -> tuple[dict[str, Any], Path]:
     out = tmp_path_factory.mktemp("judged") / "out"
     options = EvaluateOptions(avatar_file, tiny_capture, out=out, device="cpu")
-    return evaluate_run(options), out
+    told: list[float] = []
+    metrics = evaluate_run(options, lambda share, doing: told.append(share))
+    assert told == sorted(told) and len(told) > 1 and told[-1] <= 1
+    return metrics, out
 
 
 def test_the_object_has_the_keys_of_the_product_page(judged: tuple[dict[str, Any], Path]) -> None:

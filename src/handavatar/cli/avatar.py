@@ -49,9 +49,15 @@ def evaluate(words: list[str]) -> int:
     """PSNR, SSIM, LPIPS, mask IoU and what the truth allows, on held-out frames."""
     from handavatar.cli.arguments import JSON, parse_with, print_figures, print_json
     from handavatar.evaluate.run import EvaluateOptions, evaluate_run
+    from handavatar.train.progress import Progress
 
     options, extras = parse_with(EvaluateOptions, (JSON,), words, "evaluate", ("run",))
-    (print_json if extras["json"] else print_figures)(evaluate_run(options))
+    with Progress("evaluate", 100) as progress:
+        metrics = evaluate_run(
+            options, lambda share, doing: progress.update(round(100 * share), doing)
+        )
+        progress.update(100)
+    (print_json if extras["json"] else print_figures)(metrics)
     return 0
 
 

@@ -1,7 +1,7 @@
 """Judges a trained avatar on the held-out frames of its capture."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,7 +86,9 @@ class _Protocol:
     judged: list[JudgedFrame]
 
 
-def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
+def evaluate_run(
+    options: EvaluateOptions, progress: Callable[[float, str], None] | None = None
+) -> dict[str, Any]:
     """Renders the split and measures it; writes pictures, a report, a sheet and a film.
 
     Captures whose poses are known are judged in these (protocol ``known``). Of those made from
@@ -94,6 +96,10 @@ def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
     (``mask``: how well the avatar is driven), and with this pose drawn to the colours, the avatar
     frozen (``registered``: how well it can look). The figures outside of ``protocols`` are those
     of ``known`` or ``mask``.
+
+    Args:
+        options: what to judge.
+        progress: told the share that is done, in [0, 1], and what is being done.
 
     Returns:
         The object that ``handavatar evaluate --json`` prints.
@@ -115,29 +121,47 @@ def evaluate_run(options: EvaluateOptions) -> dict[str, Any]:
         )
     claim_folder(out, EVALUATION)
     frames = [capture.frame(index) for index in indices]
-    protocols = _protocols(avatar, frames, capture.is_tracked)
+    report = progress or (lambda share, doing: None)
+    protocols = _protocols(avatar, frames, capture.is_tracked, report)
+    report(0.9, "measuring")
     metrics = _measured(options, capture, avatar, frames, protocols)
     _write(out, metrics, capture, frames, protocols, options)
     return metrics
 
 
-def _protocols(avatar: HandAvatar, frames: list[Frame], is_tracked: bool) -> dict[str, _Protocol]:
+def _protocols(
+    avatar: HandAvatar,
+    frames: list[Frame],
+    is_tracked: bool,
+    report: Callable[[float, str], None],
+) -> dict[str, _Protocol]:
     """By name; the first one is that of the figures outside of ``protocols``."""
     if not is_tracked:
-        return {"known": _rendered(avatar, frames, [frame.pose for frame in frames])}
-    fitted = _rendered(avatar, frames, held_out_poses(avatar, frames))
+        poses = [frame.pose for frame in frames]
+        return {"known": _rendered(avatar, frames, poses, lambda done: report(0.9 * done, "known"))}
+    report(0.0, "laying the hand onto masks")
+    held_out = held_out_poses(avatar, frames)
+    fitted = _rendered(avatar, frames, held_out, lambda done: report(0.1 + 0.4 * done, "mask"))
     poses = [
         registered_pose(avatar, frame, pose, rendering)
         for frame, pose, rendering in zip(frames, fitted.poses, fitted.renderings, strict=True)
     ]
-    return {"mask": fitted, "registered": _rendered(avatar, frames, poses)}
+    registered = _rendered(
+        avatar, frames, poses, lambda done: report(0.5 + 0.4 * done, "registered")
+    )
+    return {"mask": fitted, "registered": registered}
 
 
-def _rendered(avatar: HandAvatar, frames: list[Frame], poses: list[HandPose]) -> _Protocol:
-    renderings = [
-        _on_cpu(avatar.render(pose, frame.camera))
-        for frame, pose in zip(frames, poses, strict=True)
-    ]
+def _rendered(
+    avatar: HandAvatar,
+    frames: list[Frame],
+    poses: list[HandPose],
+    report: Callable[[float], None],
+) -> _Protocol:
+    renderings = []
+    for number, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
+        report(number / len(frames))
+        renderings.append(_on_cpu(avatar.render(pose, frame.camera)))
     judged = [
         judged_frame(frame, rendering.color, rendering.alpha)
         for frame, rendering in zip(frames, renderings, strict=True)
