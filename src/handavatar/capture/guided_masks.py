@@ -33,6 +33,7 @@ from handavatar.capture.masks import (
     oklab_from_srgb,
     settled,
     sure_and_spread,
+    without_rim,
 )
 from handavatar.capture.outlines import silhouette
 from handavatar.capture.tracking import TrackedHand
@@ -268,8 +269,8 @@ def find_guided_mask(
     labels[core] = HAND
     is_sure = labels == BACKGROUND
     cut = cleaned_mask(graph_cut(image, labels), core, scale) & ~is_sure
-    level, clearness = settled(image, cut, is_sure)
-    pixels = cleaned_mask(level > 0.5, core, scale)
+    level, clearness = settled(image, cut, without_rim(is_sure))
+    pixels = cleaned_mask((level > 0.5) & allowed, core, scale) & allowed
     level = np.where(pixels == (level > 0.5), level, pixels)
 
     cover = _cover(average, pixels, depth, before, ratio, colors, scale)

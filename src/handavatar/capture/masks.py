@@ -49,6 +49,11 @@ _BORDER_REACH = 6.0
 _BORDER_GAP = 2.0
 _BORDER_CIRCLE = 3.5
 _BORDER_NOISE = 6.0
+# Of the light on the skin at its border, as a share of it, one standard deviation: at least, and
+# in that of the light within some pixels further in.
+_LEAST_SHADING, _BORDER_SHADING, _MOST_SHADING = 0.04, 4.0, 0.3
+_SPREAD_GAP = 5.0
+_RIM = 3.0
 _BORDER_SMOOTHING = 2.0
 _BORDER_INERTIA = 0.03
 # Brightness, and half of the two colour differences of ITU-R BT.601.
@@ -285,7 +290,7 @@ def find_mask(hand: TrackedHand, colors: ColorModel) -> HandMask:
     level = settled_border(
         hand.window.image,
         cleaned_mask(cut, regions.core, regions.pixels_per_metre) & ~is_sure,
-        is_sure,
+        without_rim(is_sure),
     )
     cleaned = cleaned_mask(level > 0.5, regions.core, regions.pixels_per_metre)
     level = np.where(cleaned == (level > 0.5), level, cleaned)
@@ -362,6 +367,14 @@ def settled_border(
     return settled(image, mask, is_background)[0]
 
 
+def without_rim(is_background: Bool[np.ndarray, "side side"]) -> Bool[np.ndarray, "side side"]:
+    """What is sure to be background by its colour, but for its outermost pixels.
+
+    Skin may cover these in part, and a model of whole pixels' colours knows no mixtures.
+    """
+    return depth_inside(is_background) > _RIM
+
+
 def settled(
     image: UInt8[np.ndarray, "side side 3"],
     mask: Bool[np.ndarray, "side side"],
@@ -378,11 +391,13 @@ def settled(
         depth = depth_inside(mask)
         height = depth_inside(~mask)
         skin = _local_mean(pixels, depth > _BORDER_GAP)
+        spread = _local_spread(pixels[..., 0], depth > _SPREAD_GAP)
         beside = _local_mean(pixels, height > _BORDER_GAP)
         apart = skin - beside
-        contrast = (apart**2).sum(-1)
+        weighed = _without_shading(apart, skin, spread)
+        contrast = (apart * weighed).sum(-1)
         clearness = contrast / (contrast + _BORDER_NOISE**2)
-        share = (((pixels - beside) * apart).sum(-1) / (contrast + 1e-6)).clip(0, 1)
+        share = (((pixels - beside) * weighed).sum(-1) / (contrast + 1e-6)).clip(0, 1)
         is_free = (depth <= _BORDER_REACH) & (height <= _BORDER_REACH) & ~is_background
         trust = np.where(is_free, clearness, 1.0)
         value = trust * np.where(is_free, share, mask) + _BORDER_INERTIA * mask
@@ -392,6 +407,38 @@ def settled(
         level = np.where(is_free, smooth, mask).clip(0, 1)
         mask = level > 0.5
     return level, clearness
+
+
+def _without_shading(
+    apart: Float[np.ndarray, "side side 3"],
+    skin: Float[np.ndarray, "side side 3"],
+    spread: Float[np.ndarray, "side side"],
+) -> Float[np.ndarray, "side side 3"]:
+    """Differences of colours, less most of what a brighter or darker light on the skin makes of it.
+
+    The lit side of a finger may be as bright as the wall behind it, and brighter than the skin next
+    to it; it is skin by its hue. As noise and shading are expected, this is their covariance's
+    inverse times the difference, in units of the noise.
+
+    Args:
+        apart: skin less what is beside it.
+        skin: its colour.
+        spread: of its brightness, one standard deviation.
+    """
+    share = np.maximum(_LEAST_SHADING, _BORDER_SHADING * spread / (skin[..., 0] + 1e-6))
+    shading = (np.minimum(share, _MOST_SHADING) ** 2)[..., None]
+    length = (skin**2).sum(-1, keepdims=True)
+    along = (apart * skin).sum(-1, keepdims=True)
+    return apart - skin * (shading * along / (_BORDER_NOISE**2 + shading * length))
+
+
+def _local_spread(
+    values: Float[np.ndarray, "side side"], is_used: Bool[np.ndarray, "side side"]
+) -> Float[np.ndarray, "side side"]:
+    """Standard deviation of the used pixels around each pixel."""
+    powers = np.stack([values, values**2, values], axis=-1)
+    mean, squared, _ = np.moveaxis(_local_mean(powers, is_used), -1, 0)
+    return np.sqrt((squared - mean**2).clip(0))
 
 
 def _local_mean(
