@@ -191,7 +191,7 @@ def register_frames(
     )
     return register(
         hands,
-        [_observe(frame) for frame in frames],
+        [observe_frame(frame) for frame in frames],
         tracked,
         information,
         options,
@@ -206,7 +206,8 @@ def poses_of(found: Registered) -> list[HandPose]:
     return [HandPose(rotations, translation) for rotations, translation in pairs]
 
 
-def _observe(frame: Frame) -> Observation:
+def observe_frame(frame: Frame) -> Observation:
+    """What a frame of a capture shows."""
     picture = FramePicture.of(
         frame.camera, frame.image.float() / 255, frame.alpha, frame.known, frame.gain
     )

@@ -5,6 +5,7 @@ other poses. Then the shape shares the blame, and how far the tracked poses are 
 how far they had to move. The texture comes last, when the start is not spoilt, from coarse to fine.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -13,10 +14,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from handavatar.fit.appearance import SkinTexture, fit_texture
+from handavatar.fit.appearance import SkinTexture, fit_texture, see_texture
 from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
 from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, moved_pose, pose_difference
 from handavatar.fit.landmarks import landmark_rest, offset_tolerances
+from handavatar.fit.pictures import FramePicture
 from handavatar.fit.shape import ShapeSpace, fixed_shape
 from handavatar.fit.solver import Descent, Look
 from handavatar.geometry.meshes import SurfacePoints, sample_surface_evenly
@@ -36,6 +38,7 @@ _TILTED_EVERY = 3
 _THOROUGH_STEPS = 4
 _TRIED_STEPS = 2
 """Of each width, from a pose that is tried."""
+_FOLLOWED_STEPS = 4
 _FINE = 0.7
 """Pixels of blur while outlines alone are looked at."""
 _BAD = 1.3
@@ -238,6 +241,69 @@ def _register(
         error,
         look.texture,
     )
+
+
+@torch.no_grad()
+def follow_picture(
+    hand: ShapedHand,
+    seen: Observation,
+    shown: FramePicture,
+    pose: HandPose,
+    information: Float[Tensor, "51 51"],
+    options: RegisterOptions,
+) -> HandPose:
+    """One pose, drawn to a picture's outline and texture, when it is known how the hand looks.
+
+    Args:
+        hand: rest hand; its shape stays.
+        seen: the picture to follow.
+        shown: how the hand looks in the pose to begin with, from the same camera.
+        pose: to begin with.
+        information: inverse covariance of its errors.
+        options: sizes of details, expected errors.
+
+    Returns:
+        The pose to begin with, unless outline and texture agree better with another one.
+    """
+    surface, space = _compared_points(hand.rig), fixed_shape(hand.rig)
+    none = RestPoints(torch.zeros(0, 3), torch.zeros(0, 16), torch.zeros(0, 3, 0))
+    start = HandPose(pose.rotations[None], pose.translation[None])
+    with one_thread():
+        descent = Descent(
+            observations=[seen],
+            times=torch.zeros(1),
+            tracked=start,
+            information=information[None],
+            points_of=lambda shared, frame: HandPoints(hand, space, surface, none),
+            shared_sigmas=space.sigmas,
+            options=options.energy,
+            is_sequence=False,
+            poses=start,
+            shared=torch.zeros(0),
+            threads=1,
+        )
+        vertices = hand.posed(pose).vertices
+        look = Look(_FINE, _NARROW)
+        for sigma in options.texture_sigmas:
+            size = sigma * seen.picture.camera.width / 256
+            known = see_texture(hand.rig, vertices, surface, shown, shown.band(size))
+            trust = torch.zeros(len(surface.faces)).index_add_(0, known.index, known.facing)
+            values = torch.zeros(len(trust), 3).index_add_(0, known.index, known.values)
+            texture = SkinTexture(values, torch.where(trust > 0, 1.0, 0.0))
+            photographed = see_texture(
+                hand.rig, vertices, surface, seen.picture, descent.band(0, size)
+            )
+            both = photographed.index[trust[photographed.index] > 0]
+            if len(both) == 0:
+                return pose
+            apart = photographed.values[trust[photographed.index] > 0] - values[both]
+            error = float(apart.norm(dim=-1).median()) / math.sqrt(3)
+            look = Look(size, _NARROW, texture, max(error, _LEAST_TEXTURE_ERROR))
+            descent.step_poses(look, _FOLLOWED_STEPS)
+        found, after = descent.poses, float(descent.energies(look))
+        descent.poses = start
+        before = float(descent.energies(look))
+    return HandPose(found.rotations[0], found.translation[0]) if after < before else pose
 
 
 @lru_cache(maxsize=4)
