@@ -95,6 +95,24 @@ def test_no_hand_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "light" in caught.value.remedy
 
 
+def test_frames_of_the_other_hand_are_left_out_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """First the right hand, with one picture taken for a left one, then the left hand."""
+    others = {i: [_sighting(False)] for i in (4, *range(20, 35))}
+    _install(monkeypatch, others)
+    track = track_hand(_frames(35))
+    assert track.side == "right" and 4 in [hand.index for hand in track.hands]
+    left_out = sorted(track.skipped)
+    # Where the hands change, a picture or two may count for either.
+    assert left_out[-1] == 34 and 20 <= left_out[0] <= 22
+    assert len(left_out) == 35 - left_out[0] and set(track.skipped.values()) == {"the other hand"}
+    assert len(track.glances) == 35
+    left = track_hand(_frames(35), "left")
+    assert left.side == "left" and [hand.index for hand in left.hands] == left_out
+    # One hand all along, seen in a mirror: the wish turns it, and all pictures stay.
+    _install(monkeypatch, {})
+    assert len(track_hand(_frames(35), "left").hands) == 35
+
+
 def test_a_left_hand_is_mirrored_to_a_right_one(monkeypatch: pytest.MonkeyPatch) -> None:
     _install(monkeypatch, {i: [_sighting(False)] for i in range(10)})
     track = track_hand(_frames(10))

@@ -6,13 +6,13 @@ by 35 degrees either way. Their median is steadier than any one of them, and whe
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 
 from handavatar.capture.checks import CaptureError
@@ -33,11 +33,13 @@ _TURNS = (math.radians(35), math.radians(-35))
 _VIEW_SIDE = 448
 _VIEW_SCALE = 2.0
 _MAX_SHARE_OF_TWO_HANDS = 0.1
+# Seconds before or after; pictures in there that speak for the other hand, and their share.
+_SIDE_WINDOW, _MIN_AGAINST, _AGAINST_SHARE = 0.6, 4, 0.8
 _MIN_FRAMES = 8
 _GLANCE_SIDE = 160
 # Of the picture's brightness, 0 to 255: below, a camera sees noise rather than skin.
 _DARK = 30.0
-TWO_HANDS, NO_HAND = "two hands", "no hand found"
+TWO_HANDS, NO_HAND, OTHER_HAND = "two hands", "no hand found", "the other hand"
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,8 +253,17 @@ def track_hand(
                 skipped[frame.index] = TWO_HANDS if found else NO_HAND
             if progress is not None:
                 progress(count + 1, "tracking")
+    majority = "right" if sum(is_right) >= 0 else "left"
+    others = find_other_hand(np.array(is_right), [hand.time for hand in hands])
+    if side not in ("auto", majority) and len(hands) > others.sum() >= _MIN_FRAMES:
+        # Both hands are there one after the other, and the smaller part is asked for.
+        others = ~others
+    for hand, is_other in zip(hands, others, strict=True):
+        if is_other:
+            skipped[hand.index] = OTHER_HAND
+    hands = [hand for hand, is_other in zip(hands, others, strict=True) if not is_other]
     if side == "auto":
-        side = "right" if sum(is_right) >= 0 else "left"
+        side = majority
     if side == "left":
         hands = [hand.mirrored() for hand in hands]
         glances = [glance.mirrored() for glance in glances]
@@ -261,6 +272,36 @@ def track_hand(
     track = Track(side, tuple(hands), skipped, picture_size, tuple(glances), share)
     _check_found(track)
     return track
+
+
+def find_other_hand(
+    votes: Float[np.ndarray, "hands"], times: Sequence[float]
+) -> Bool[np.ndarray, "hands"]:
+    """Frames whose neighbourhood clearly shows the hand that is not that of most frames.
+
+    A tracker mistakes single pictures, of a fist or of a hand seen edge-on; it does not mistake all
+    pictures of a second.
+
+    Args:
+        votes: certainty of a right hand, negative that of a left one, in [-1, 1].
+        times: seconds, growing.
+    """
+    is_other = np.zeros(len(votes), dtype=bool)
+    if len(votes) == 0:
+        return is_other
+    sign = 1.0 if votes.sum() >= 0 else -1.0
+    is_against = sign * votes < 0
+    moments = np.array(times)
+    for number in np.flatnonzero(is_against):
+        is_near = np.abs(moments - moments[number]) <= _SIDE_WINDOW
+        is_near[max(0, number - _MIN_AGAINST) : number + _MIN_AGAINST + 1] = True
+        # Before or after: at a change of hands one of the two is clear.
+        for part in (slice(number + 1), slice(number, None)):
+            near = np.zeros_like(is_near)
+            near[part] = is_near[part]
+            count = int((is_against & near).sum())
+            is_other[number] |= count >= max(_MIN_AGAINST, _AGAINST_SHARE * near.sum())
+    return is_other
 
 
 def _glance(frame: VideoFrame) -> Glance:

@@ -57,6 +57,7 @@ from handavatar.capture.registration import (
 from handavatar.capture.seen_skin import SeenSkin, count_seen_skin
 from handavatar.capture.tracking import (
     NO_HAND,
+    OTHER_HAND,
     TWO_HANDS,
     Track,
     TrackedHand,
@@ -190,6 +191,10 @@ CAUSES: dict[str, tuple[str, str]] = {
     "small": ("the hand is too small", "come closer to the camera"),
     "dark": ("the pictures are too dark", "record in more light"),
     TWO_HANDS: ("there are two hands", "record one hand alone, or crop the video to it"),
+    OTHER_HAND: (
+        "it is the other hand",
+        "record one hand, or choose it with --side left or --side right",
+    ),
     NO_HAND: ("no hand is seen", "record one bare hand, whole, larger than a sixth of the picture"),
 }
 """What goes wrong with a picture, and what to do about it."""
