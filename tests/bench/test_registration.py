@@ -20,6 +20,7 @@ from handavatar.bench.registration import (
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.frames import read_capture
 from handavatar.geometry.cameras import Camera
+from handavatar.synthetic.films import FilmOptions, make_film
 from handavatar.synthetic.truth import FilmTruth
 
 
@@ -135,3 +136,20 @@ def test_nothing_kept_leaves_errors_open(small_film: FilmTruth) -> None:
     figures = judge_film(truth, clip, tried=1).figures
     assert figures["vertices_mm"] is None and figures["mask_iou"] is None
     assert figures["frames_kept"] == 0 and figures["rejected_right"] == 1
+
+
+@pytest.mark.slow
+def test_a_film_goes_all_the_way(tmp_path: Path) -> None:
+    pytest.importorskip("mediapipe")
+    film = FilmOptions(
+        "short", 21, 0.2, ("spread", "relaxed"), width=320, height=240, seconds=1.6, fps=10.0
+    )
+    make_film(film, tmp_path / "films")
+    options = RegistrationTableOptions(films=tmp_path / "films", cases=("video",))
+    rows = registration_table(options).cases["video"]
+    assert {"tracked", "fitted", "outlines", "registered"} == set(rows)
+    kept = rows["registered"]["frames_kept"]
+    assert isinstance(kept, float) and kept > 0.5
+    off = {row: figures["vertices_mm"] for row, figures in rows.items()}
+    assert all(isinstance(value, float) and 1 < value < 25 for value in off.values())
+    assert off["registered"] < off["tracked"]
