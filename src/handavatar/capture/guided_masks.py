@@ -393,13 +393,13 @@ def cut_at_wrist(
 def is_cut_unsure(
     mesh: Bool[np.ndarray, "side side"], line: WristLine, scale: float
 ) -> Bool[np.ndarray, "side side"]:
-    """Pixels at the cut: skin goes on there, and the mesh's own end is no straight line.
+    """Pixels at the cut and behind it: skin goes on there, and the hand's own end is no line.
 
     Args:
         mesh: pixels that the fitted hand covers, its wrist closed.
         line: where the mask is cut.
         scale: pixels per metre.
     """
-    before = line.before_pixels(len(mesh))
-    near = grown(mesh, _LIMIT * scale)
-    return near & ((np.abs(before) < max(1.0, _WRIST_BAND * scale)) | (mesh & (before < 0)))
+    return grown(mesh, _LIMIT * scale) & (
+        line.before_pixels(len(mesh)) < max(1.0, _WRIST_BAND * scale)
+    )
