@@ -11,6 +11,7 @@ import torch
 from handavatar.avatar import HandAvatar, Rendering
 from handavatar.capture.frames import Frame
 from handavatar.capture.registration import observe_frame
+from handavatar.fit.energy import EnergyOptions
 from handavatar.fit.pictures import FramePicture
 from handavatar.fit.register import RegisterOptions, follow_picture
 from handavatar.hand.pose import NUM_BONES, HandPose
@@ -19,6 +20,8 @@ from handavatar.hand.rig import ShapedHand
 # Expected errors of the pose to start from: radians of a joint about each axis; metres.
 _ROTATION_ERROR = math.radians(3) / 3**0.5
 _TRANSLATION_ERROR = (0.003, 0.003, 0.006)
+# As of a video: what the hand looks like is known, and not learned from poses that are off.
+_TEXTURE_SHARE = 2.0
 
 
 @torch.no_grad()
@@ -47,7 +50,8 @@ def registered_pose(
         torch.ones(3),
     )
     errors = torch.tensor([*[_ROTATION_ERROR] * (3 * NUM_BONES), *_TRANSLATION_ERROR])
+    options = RegisterOptions(energy=EnergyOptions(texture_share=_TEXTURE_SHARE))
     followed = follow_picture(
-        hand, observe_frame(frame), shown, start, torch.diag(errors**-2), RegisterOptions()
+        hand, observe_frame(frame), shown, start, torch.diag(errors**-2), options
     )
     return followed.to(pose.rotations.device)

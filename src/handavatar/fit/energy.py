@@ -48,7 +48,7 @@ class EnergyOptions:
     """Pixels that a point of the mask's outline goes rather than turn its normal by a radian."""
     texture_outlier: float = 3.5
     """Standard deviations beyond which a detail has other causes: a shadow's edge, a fold."""
-    texture_share: float = 0.5
+    texture_share: float = 0.1
     """Weight of the details that a picture of the hand has room for, each of a blurred pixel."""
     landmark_outlier: float = 3.0
     """Standard deviations beyond which a landmark is misplaced."""
