@@ -436,19 +436,19 @@ def _local_spread(
     values: Float[np.ndarray, "side side"], is_used: Bool[np.ndarray, "side side"]
 ) -> Float[np.ndarray, "side side"]:
     """Standard deviation of the used pixels around each pixel."""
-    powers = np.stack([values, values**2, values], axis=-1)
-    mean, squared, _ = np.moveaxis(_local_mean(powers, is_used), -1, 0)
+    powers = np.stack([values, values**2], axis=-1)
+    mean, squared = np.moveaxis(_local_mean(powers, is_used), -1, 0)
     return np.sqrt((squared - mean**2).clip(0))
 
 
 def _local_mean(
-    values: Float[np.ndarray, "side side 3"], is_used: Bool[np.ndarray, "side side"]
-) -> Float[np.ndarray, "side side 3"]:
+    values: Float[np.ndarray, "side side channels"], is_used: Bool[np.ndarray, "side side"]
+) -> Float[np.ndarray, "side side channels"]:
     """Mean over the used pixels around each pixel; over a wider circle where none is near."""
-    weighed = np.where(is_used[..., None], np.insert(values, 3, 1.0, axis=-1), 0.0)
+    weighed = np.where(is_used[..., None], np.insert(values, values.shape[-1], 1.0, axis=-1), 0.0)
     weighed = weighed.astype(np.float32)
     total = _blurred(weighed, _BORDER_CIRCLE) + 1e-3 * _blurred(weighed, 3 * _BORDER_CIRCLE)
-    return total[..., :3] / (total[..., 3:] + 1e-12)
+    return total[..., :-1] / (total[..., -1:] + 1e-12)
 
 
 def _blurred(

@@ -1,6 +1,6 @@
-"""The hand of a video laid onto its landmarks, masks and colours by the one fit (:mod:`fit`).
+"""The hand of a video laid onto its landmarks, masks and texture by the one fit (:mod:`fit`).
 
-First the landmarks alone say about where it is; then outlines, and at last colours, join them.
+First the landmarks alone say about where it is; then outlines, and at last the texture, join them.
 """
 
 from collections.abc import Callable, Sequence

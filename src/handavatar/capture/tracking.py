@@ -287,8 +287,6 @@ def find_other_hand(
         times: seconds, growing.
     """
     is_other = np.zeros(len(votes), dtype=bool)
-    if len(votes) == 0:
-        return is_other
     sign = 1.0 if votes.sum() >= 0 else -1.0
     is_against = sign * votes < 0
     moments = np.array(times)
@@ -297,10 +295,8 @@ def find_other_hand(
         is_near[max(0, number - _MIN_AGAINST) : number + _MIN_AGAINST + 1] = True
         # Before or after: at a change of hands one of the two is clear.
         for part in (slice(number + 1), slice(number, None)):
-            near = np.zeros_like(is_near)
-            near[part] = is_near[part]
-            count = int((is_against & near).sum())
-            is_other[number] |= count >= max(_MIN_AGAINST, _AGAINST_SHARE * near.sum())
+            near = is_against[part][is_near[part]]
+            is_other[number] |= near.sum() >= max(_MIN_AGAINST, _AGAINST_SHARE * len(near))
     return is_other
 
 

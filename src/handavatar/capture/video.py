@@ -429,7 +429,7 @@ def _registered(
     options: RegisterOptions,
     report: Callable[[float], None],
 ) -> FittedHands:
-    """The hand laid onto landmarks, masks and colours: the one place that knows how."""
+    """The hand laid onto landmarks, masks and texture: the one place that knows how."""
     seen = observations_of(track)
     observations = observe_hands(track.hands, masks, known, gains, seen, before.fit.focal)
     fit, found = register_hands(rig, before.fit, observations, options, report)

@@ -39,9 +39,6 @@ def registered_pose(
     if rendering is None:
         rendering = avatar.render(pose, frame.camera)
     start = pose.to("cpu")
-    found = avatar.coarse_personal(pose.to(avatar.device))
-    rig = found.rig.to("cpu")
-    hand = ShapedHand(rig, found.rest_vertices.cpu(), found.rest_joints.cpu())
     shown = FramePicture.of(
         frame.camera,
         rendering.color.cpu(),
@@ -52,6 +49,24 @@ def registered_pose(
     errors = torch.tensor([*[_ROTATION_ERROR] * (3 * NUM_BONES), *_TRANSLATION_ERROR])
     options = RegisterOptions(energy=EnergyOptions(texture_share=_TEXTURE_SHARE))
     followed = follow_picture(
-        hand, observe_frame(frame), shown, start, torch.diag(errors**-2), options
+        fitted_hand(avatar, pose),
+        observe_frame(frame),
+        shown,
+        start,
+        torch.diag(errors**-2),
+        options,
     )
     return followed.to(pose.rotations.device)
+
+
+def fitted_hand(avatar: HandAvatar, pose: HandPose) -> ShapedHand:
+    """The avatar's coarse rest hand as a fit takes it: with what this pose adds, on the CPU.
+
+    Args:
+        avatar: whose shape it is.
+        pose: that decides the offsets of the skin.
+    """
+    hand = avatar.coarse_personal(pose.to(avatar.device))
+    # A rig that stays where it is stays the same object: what a fit has found of it is kept.
+    rig = hand.rig.to("cpu") if avatar.device.type != "cpu" else hand.rig
+    return ShapedHand(rig, hand.rest_vertices.cpu(), hand.rest_joints.cpu())

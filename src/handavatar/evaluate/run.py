@@ -28,7 +28,7 @@ from handavatar.evaluate.metrics import (
     shading_correlation,
 )
 from handavatar.evaluate.perceptual import LpipsVgg, perceptual_loss
-from handavatar.evaluate.registered import registered_pose
+from handavatar.evaluate.registered import fitted_hand, registered_pose
 from handavatar.evaluate.report import (
     Curve,
     ReportRow,
@@ -40,7 +40,6 @@ from handavatar.evaluate.report import (
 )
 from handavatar.fit.register import RegisterOptions
 from handavatar.hand.pose import HandPose
-from handavatar.hand.rig import ShapedHand
 from handavatar.jobs.files import FolderKind, claim_folder
 
 
@@ -93,7 +92,7 @@ def evaluate_run(
 
     Captures whose poses are known are judged in these (protocol ``known``). Of those made from
     videos every frame is judged twice: with its pose fitted to the mask and never to the colours
-    (``mask``: how well the avatar is driven), and with this pose drawn to the colours, the avatar
+    (``mask``: how well the avatar is driven), and with this pose drawn to the texture, the avatar
     frozen (``registered``: how well it can look). The figures outside of ``protocols`` are those
     of ``known`` or ``mask``.
 
@@ -175,11 +174,7 @@ def held_out_poses(avatar: HandAvatar, frames: list[Frame]) -> list[HandPose]:
     Training corrects the poses of its own frames; held-out frames get the same chance, with the
     avatar's shape as it is.
     """
-    hands = []
-    for frame in frames:
-        hand = avatar.coarse_personal(frame.pose.to(avatar.device))
-        rig = hand.rig.to("cpu") if avatar.device.type != "cpu" else hand.rig
-        hands.append(ShapedHand(rig, hand.rest_vertices.cpu(), hand.rest_joints.cpu()))
+    hands = [fitted_hand(avatar, frame.pose) for frame in frames]
     options = RegisterOptions(
         pose_error=float(avatar.info.get("pose_error", RegisterOptions.pose_error)),
         learns_pose_error=False,
@@ -275,7 +270,7 @@ _POSE_NOTES = {
     "known": ["poses are those of the capture, which knows them"],
     "mask": [
         "poses of the judged frames were fitted to their masks (protocol mask), and from there to "
-        "their colours with the avatar frozen (protocol registered); the latter says how well the "
+        "their texture with the avatar frozen (protocol registered); the latter says how well the "
         "avatar can look, not how well it is driven",
         "mask_iou of poses that were fitted to masks is no evidence of right poses",
     ],

@@ -27,6 +27,7 @@ _LEAST_DEPTH = 1.0
 """Pixels inside the outline."""
 _ROUNDS = 4
 _SHYNESS = 0.3
+"""Views from the front that say a point has no texture."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +75,45 @@ def see_points(
 
 
 @dataclass(frozen=True, eq=False)
+class PointsInBand:
+    """What a band of a picture has where points of the skin are.
+
+    Attributes:
+        seen: the points.
+        values: of the band.
+        slopes: of the values, per pixel.
+        is_compared: visible, known, and well inside the mask.
+    """
+
+    seen: SeenPoints
+    values: Float[Tensor, "points 3"]
+    slopes: Float[Tensor, "points 3 2"]
+    is_compared: Bool[Tensor, "points"]
+
+
+def look_up_points(
+    rig: Rig,
+    vertices: Float[Tensor, "vertices 3"],
+    points: SurfacePoints,
+    picture: FramePicture,
+    band: PictureBand,
+) -> PointsInBand:
+    """Points of a posed mesh, looked up in a band of a picture.
+
+    Args:
+        rig: of the mesh.
+        vertices: posed, metres, world.
+        points: on the mesh.
+        picture: the frame.
+        band: of it.
+    """
+    seen = see_points(rig, vertices, points, picture.camera)
+    values, slopes = band.sample(seen.pixels)
+    is_inside = (values[:, 3] < -_LEAST_DEPTH) & picture.is_known(seen.pixels)
+    return PointsInBand(seen, values[:, :3], slopes[:, :3], seen.is_visible & is_inside)
+
+
+@dataclass(frozen=True, eq=False)
 class SkinTexture:
     """What every point shows in one band of the pictures.
 
@@ -117,11 +157,9 @@ def see_texture(
         picture: the frame.
         band: of it.
     """
-    seen = see_points(rig, vertices, points, picture.camera)
-    values, _ = band.sample(seen.pixels)
-    is_used = seen.is_visible & (values[:, 3] < -_LEAST_DEPTH) & picture.is_known(seen.pixels)
-    index = is_used.nonzero()[:, 0]
-    return SeenTexture(index, values[index, :3], seen.facing[index])
+    found = look_up_points(rig, vertices, points, picture, band)
+    index = found.is_compared.nonzero()[:, 0]
+    return SeenTexture(index, found.values[index], found.seen.facing[index])
 
 
 def fit_texture(seen: list[SeenTexture], num_points: int) -> tuple[SkinTexture, float]:

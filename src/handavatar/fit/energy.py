@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from handavatar.fit.appearance import SkinTexture, see_points
+from handavatar.fit.appearance import SkinTexture, look_up_points
 from handavatar.fit.kinematics import (
     NUM_UNKNOWNS,
     RestPoints,
@@ -108,7 +108,7 @@ class HandPoints:
     Attributes:
         hand: rest hand.
         space: shared unknowns of its shape.
-        surface: points whose colours are compared.
+        surface: points whose texture is compared.
         landmarks: what a tracker's landmarks are on the rest hand; no points without a tracker.
             Their directions are those of the shape and then of each landmark's own offset.
     """
@@ -294,20 +294,18 @@ def _add_texture(
 ) -> None:
     """Visible points that face the camera, inside the mask, show what they show in others."""
     camera = picture.camera
-    seen = see_points(hand.rig, vertices, points.surface, camera)
-    values, slopes = band.sample(seen.pixels)
-    is_compared = seen.is_visible & (values[:, 3] < -1) & (texture.trust > _LEAST_TRUST)
-    index = (is_compared & picture.is_known(seen.pixels)).nonzero()[:, 0]
+    found = look_up_points(hand.rig, vertices, points.surface, picture, band)
+    index = (found.is_compared & (texture.trust > _LEAST_TRUST)).nonzero()[:, 0]
     if len(index) < 10:
         return
-    residuals = (values[index, :3] - texture.values[index]) / texture_error
+    residuals = (found.values[index] - texture.values[index]) / texture_error
     rest = surface_rest(points, hand, index)
     _, _, moving = pixel_jacobian(camera, skeleton.positions(rest))
     moving = moving @ skeleton.jacobian(rest)
-    jacobian = (slopes[index, :3] @ moving / texture_error).flatten(0, 1)
+    jacobian = (found.slopes[index] @ moving / texture_error).flatten(0, 1)
     blur_area = 4 * math.pi * (sigma**2 + 0.5)
     count = options.texture_share * float(picture.hand.sum()) / blur_area
-    weights = seen.facing[index]
+    weights = found.seen.facing[index]
     weights = weights * (count / weights.sum())
     distance = residuals.norm(dim=-1, keepdim=True).expand(-1, 3)
     total.add(

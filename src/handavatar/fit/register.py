@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from handavatar.fit.appearance import SkinTexture, fit_texture, see_texture
+from handavatar.fit.appearance import SkinTexture, fit_texture, look_up_points
 from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
 from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, moved_pose, pose_difference
 from handavatar.fit.landmarks import landmark_rest, offset_tolerances
@@ -39,6 +39,8 @@ _THOROUGH_STEPS = 4
 _TRIED_STEPS = 2
 """Of each width, from a pose that is tried."""
 _FOLLOWED_STEPS = 4
+"""At each size of details, of a picture that is followed."""
+_NO_LANDMARKS = RestPoints(torch.zeros(0, 3), torch.zeros(0, 16), torch.zeros(0, 3, 0))
 _FINE = 0.7
 """Pixels of blur while outlines alone are looked at."""
 _BAD = 1.3
@@ -167,13 +169,14 @@ def _register(
     space = ShapeSpace.around(rig, options.coefficient_sigma) if learns_shape else fixed_shape(rig)
     generator = torch.Generator().manual_seed(options.seed)
     surface = _compared_points(rig)
-    none = RestPoints(torch.zeros(0, 3), torch.zeros(0, 16), torch.zeros(0, 3, 0))
     has_landmarks = any(seen.landmarks is not None for seen in observations)
     num_shapes = len(space.sigmas)
 
     def points_of(shared: Float[Tensor, "shared"], frame: int) -> HandPoints:
         shaped = space.shaped(hands[frame if len(hands) > 1 else 0], shared[:num_shapes])
-        landmarks = landmark_rest(shaped, space, shared[num_shapes:]) if has_landmarks else none
+        landmarks = (
+            landmark_rest(shaped, space, shared[num_shapes:]) if has_landmarks else _NO_LANDMARKS
+        )
         return HandPoints(shaped, space, surface, landmarks)
 
     sigmas = torch.cat([space.sigmas, offset_tolerances()]) if has_landmarks else space.sigmas
@@ -266,7 +269,6 @@ def follow_picture(
         The pose to begin with, unless outline and texture agree better with another one.
     """
     surface, space = _compared_points(hand.rig), fixed_shape(hand.rig)
-    none = RestPoints(torch.zeros(0, 3), torch.zeros(0, 16), torch.zeros(0, 3, 0))
     start = HandPose(pose.rotations[None], pose.translation[None])
     with one_thread():
         descent = Descent(
@@ -274,7 +276,7 @@ def follow_picture(
             times=torch.zeros(1),
             tracked=start,
             information=information[None],
-            points_of=lambda shared, frame: HandPoints(hand, space, surface, none),
+            points_of=lambda shared, frame: HandPoints(hand, space, surface, _NO_LANDMARKS),
             shared_sigmas=space.sigmas,
             options=options.energy,
             is_sequence=False,
@@ -286,18 +288,16 @@ def follow_picture(
         look = Look(_FINE, _NARROW)
         for sigma in options.texture_sigmas:
             size = sigma * seen.picture.camera.width / 256
-            known = see_texture(hand.rig, vertices, surface, shown, shown.band(size))
-            trust = torch.zeros(len(surface.faces)).index_add_(0, known.index, known.facing)
-            values = torch.zeros(len(trust), 3).index_add_(0, known.index, known.values)
-            texture = SkinTexture(values, torch.where(trust > 0, 1.0, 0.0))
-            photographed = see_texture(
+            known = look_up_points(hand.rig, vertices, surface, shown, shown.band(size))
+            photographed = look_up_points(
                 hand.rig, vertices, surface, seen.picture, descent.band(0, size)
             )
-            both = photographed.index[trust[photographed.index] > 0]
-            if len(both) == 0:
+            both = known.is_compared & photographed.is_compared
+            if not both.any():
                 return pose
-            apart = photographed.values[trust[photographed.index] > 0] - values[both]
+            apart = (photographed.values - known.values)[both]
             error = float(apart.norm(dim=-1).median()) / math.sqrt(3)
+            texture = SkinTexture(known.values, known.is_compared.to(apart))
             look = Look(size, _NARROW, texture, max(error, _LEAST_TEXTURE_ERROR))
             descent.step_poses(look, _FOLLOWED_STEPS)
         found, after = descent.poses, float(descent.energies(look))
