@@ -12,6 +12,7 @@ from handavatar.capture.frames import Frame
 from handavatar.evaluate.registered import registered_pose
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import vertex_normals
+from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import HandPose
 from handavatar.render.rasterize import interpolate, rasterize
@@ -79,6 +80,36 @@ def test_a_misread_pose_is_drawn_to_the_picture(avatar: HandAvatar) -> None:
     assert after < 0.5 * before
     # The prior keeps what the picture does not show.
     assert float((found.rotations - start.rotations).abs().max()) < 0.3
+
+
+def test_turning_the_world_changes_nothing(avatar: HandAvatar) -> None:
+    """How far a pose may be off depends on the line of sight, not on the world's axes."""
+    true = bent_pose(2)
+    frame, start = photograph(avatar, true), misread(true)
+    # Little is seen, so that the expected errors have something to say.
+    known = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    known[:45] = True
+    frame = replace(frame, known=known)
+    rendering = drawn(avatar, start, frame.camera)
+    found = registered_pose(avatar, frame, start, rendering)
+
+    turn = torch.tensor([0.4, 1.1, -0.7])
+    world = torch.eye(4)
+    world[:3, :3] = matrix_from_axis_angle(turn)
+    wrist = avatar.coarse_personal(true).rest_joints[0].detach()
+    rotations = start.rotations.clone()
+    rotations[0] = axis_angle_from_matrix(world[:3, :3] @ matrix_from_axis_angle(rotations[0]))
+    turned = HandPose(rotations, world[:3, :3] @ (wrist + start.translation) - wrist)
+    placed = frame.camera.camera_from_world @ world.T
+    view = replace(frame, camera=replace(frame.camera, camera_from_world=placed))
+    again = registered_pose(avatar, view, turned, rendering)
+
+    hand = avatar.coarse_personal(true)
+    expected = hand.posed(found).vertices @ world[:3, :3].T
+    apart = (hand.posed(again).vertices - expected).detach().norm(dim=-1)
+    assert distance(avatar, start, found) > 1e-3
+    # With errors along the world's axes, 0.27 mm.
+    assert float(apart.mean()) < 1.8e-4
 
 
 def test_gain_is_not_taken_for_a_pose_error(avatar: HandAvatar) -> None:

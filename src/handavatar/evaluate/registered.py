@@ -12,12 +12,14 @@ from handavatar.avatar import HandAvatar, Rendering
 from handavatar.capture.frames import Frame
 from handavatar.capture.registration import observe_frame
 from handavatar.fit.energy import EnergyOptions
+from handavatar.fit.kinematics import NUM_UNKNOWNS
 from handavatar.fit.pictures import FramePicture
 from handavatar.fit.register import RegisterOptions, follow_picture
-from handavatar.hand.pose import NUM_BONES, HandPose
+from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import ShapedHand
 
-# Expected errors of the pose to start from: radians of a joint about each axis; metres.
+# Expected errors of the pose to start from: radians of a joint about each axis; metres
+# across and along the line of sight.
 _ROTATION_ERROR = math.radians(3) / 3**0.5
 _TRANSLATION_ERROR = (0.003, 0.003, 0.006)
 # As of a video: what the hand looks like is known, and not learned from poses that are off.
@@ -46,14 +48,16 @@ def registered_pose(
         torch.ones_like(frame.known),
         torch.ones(3),
     )
-    errors = torch.tensor([*[_ROTATION_ERROR] * (3 * NUM_BONES), *_TRANSLATION_ERROR])
+    view = frame.camera.camera_from_world[:3, :3].cpu()
+    information = torch.eye(NUM_UNKNOWNS) / _ROTATION_ERROR**2
+    information[-3:, -3:] = view.T @ torch.diag(torch.tensor(_TRANSLATION_ERROR) ** -2) @ view
     options = RegisterOptions(energy=EnergyOptions(texture_share=_TEXTURE_SHARE))
     followed = follow_picture(
         fitted_hand(avatar, pose),
         observe_frame(frame),
         shown,
         start,
-        torch.diag(errors**-2),
+        information,
         options,
     )
     return followed.to(pose.rotations.device)
