@@ -65,7 +65,7 @@ from handavatar.capture.tracking import (
     track_hand,
 )
 from handavatar.capture.windows import Window, resampled, window_camera
-from handavatar.fit.energy import EnergyOptions
+from handavatar.fit.energy import VIDEO_TEXTURE_SHARE, EnergyOptions
 from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.cameras import project
 from handavatar.hand.rig import Rig
@@ -130,7 +130,7 @@ class VideoOptions:
             tilts=(25.0,),
             restarts=1,
             texture_rounds=2,
-            energy=EnergyOptions(texture_share=2.0),
+            energy=EnergyOptions(texture_share=VIDEO_TEXTURE_SHARE),
         )
     )
     """How the hand is laid onto masks and texture."""

@@ -11,7 +11,7 @@ import torch
 from handavatar.avatar import HandAvatar, Rendering
 from handavatar.capture.frames import Frame
 from handavatar.capture.registration import observe_frame
-from handavatar.fit.energy import EnergyOptions
+from handavatar.fit.energy import VIDEO_TEXTURE_SHARE, EnergyOptions
 from handavatar.fit.kinematics import NUM_UNKNOWNS
 from handavatar.fit.pictures import FramePicture
 from handavatar.fit.register import RegisterOptions, follow_picture
@@ -22,8 +22,6 @@ from handavatar.hand.rig import ShapedHand
 # across and along the line of sight.
 _ROTATION_ERROR = math.radians(3) / 3**0.5
 _TRANSLATION_ERROR = (0.003, 0.003, 0.006)
-# As of a video: what the hand looks like is known, and not learned from poses that are off.
-_TEXTURE_SHARE = 2.0
 
 
 @torch.no_grad()
@@ -51,7 +49,8 @@ def registered_pose(
     view = frame.camera.camera_from_world[:3, :3].cpu()
     information = torch.eye(NUM_UNKNOWNS) / _ROTATION_ERROR**2
     information[-3:, -3:] = view.T @ torch.diag(torch.tensor(_TRANSLATION_ERROR) ** -2) @ view
-    options = RegisterOptions(energy=EnergyOptions(texture_share=_TEXTURE_SHARE))
+    # As of a video: what the hand looks like is known, and not learned from poses that are off.
+    options = RegisterOptions(energy=EnergyOptions(texture_share=VIDEO_TEXTURE_SHARE))
     followed = follow_picture(
         fitted_hand(avatar, pose),
         observe_frame(frame),

@@ -30,6 +30,10 @@ from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import ShapedHand
 from handavatar.render.silhouette import OutlinePoints, outline_points
 
+VIDEO_TEXTURE_SHARE = 2.0
+"""Weight of details in frames of a video: what tracked poses are off by lasts from frame to frame
+there, and the texture knows better. Of poses with noise that is new in every frame it is not sharp
+enough to be told so much."""
 _LEAST_TRUST = 0.5
 """Views from the front by which a point's texture is known."""
 

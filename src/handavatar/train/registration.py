@@ -8,6 +8,7 @@ import torch
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
 from handavatar.capture.registration import poses_of, register_frames
+from handavatar.fit.energy import VIDEO_TEXTURE_SHARE
 from handavatar.fit.kinematics import nearest_rotations
 from handavatar.fit.register import Registered, RegisterOptions
 from handavatar.hand.pose import HandPose
@@ -35,8 +36,9 @@ def register_training(
         progress: told how far it is.
     """
     if all(frame.covariance is not None for frame in frames):
-        # Whoever knows these has looked for other poses already.
-        options = replace(options, restarts=min(options.restarts, _FEW_RESTARTS))
+        # Whoever knows these has looked for other poses already, and has drawn them to the texture.
+        energy = replace(options.energy, texture_share=VIDEO_TEXTURE_SHARE)
+        options = replace(options, restarts=min(options.restarts, _FEW_RESTARTS), energy=energy)
     rig = avatar.coarse_rig.to("cpu")
     hand = rig.shaped(avatar.coefficients.cpu())
     found = register_frames([hand], frames, options, progress=progress)
