@@ -32,7 +32,8 @@ def register_training(
         avatar: its shape coefficients and shape offsets are set.
         corrections: of the tracked poses, set as well.
         frames: of training.
-        options: expected errors, rounds.
+        options: expected errors, rounds; frames of a video, which know their covariances, get the
+            texture's weight of a video and few restarts.
         progress: told how far it is.
     """
     if all(frame.covariance is not None for frame in frames):
