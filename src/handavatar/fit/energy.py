@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from handavatar.fit.appearance import SkinTexture, look_up_points
+from handavatar.fit.contact import fill_with_balls, overlaps
 from handavatar.fit.kinematics import (
     NUM_UNKNOWNS,
     RestPoints,
@@ -54,6 +55,8 @@ class EnergyOptions:
     """Standard deviations beyond which a detail has other causes: a shadow's edge, a fold."""
     texture_share: float = 0.1
     """Weight of the details that a picture of the hand has room for, each of a blurred pixel."""
+    contact_error: float = 3e-3
+    """Metres that a hand sinks into itself, beyond what flesh gives; infinite lets it pass."""
     landmark_outlier: float = 3.0
     """Standard deviations beyond which a landmark is misplaced."""
 
@@ -176,6 +179,11 @@ def linearise_frame(
             sigma,
             options,
         )
+    if math.isfinite(options.contact_error):
+        depths, jacobian = overlaps(fill_with_balls(hand.rig), hand, points.space, skeleton)
+        ones = torch.ones_like(depths)
+        sunk = options.contact_error
+        total.add(depths / sunk, jacobian / sunk, ones, math.inf)
     if seen.landmarks is not None:
         _add_landmarks(total, points, skeleton, seen.picture.camera, seen.landmarks, options)
     return Linearised(total.hessian, total.gradient, total.energy)

@@ -4,6 +4,7 @@ Each frame has its own damping, and keeps its pose where a step does not lower i
 of the shape moves all poses with it (Schur complement), and is taken back as a whole.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -151,7 +152,7 @@ class Descent:
         Whoever goes on from the poses found, with masks and colours of their own, holds them by
         this.
         """
-        blind = replace(self.options, outline_points=0.0)
+        blind = replace(self.options, outline_points=0.0, contact_error=math.inf)
         parts = self._linearised_frames(_BLIND, self.poses, self.shared, blind)
         own = slice(NUM_UNKNOWNS)
         found = torch.stack([part.hessian[own, own] for part in parts]) + self.information

@@ -1,0 +1,144 @@
+"""A hand does not pass through itself: balls that fill it, and by how much they overlap.
+
+Outlines do not change when a finger that lies on the palm sinks into it, and hardly when it passes
+behind it. Only what a body is tells such poses apart.
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from handavatar.fit.kinematics import RestPoints, Skeleton
+from handavatar.fit.shape import ShapeSpace
+from handavatar.geometry.closest import closest_on_mesh
+from handavatar.geometry.meshes import SurfacePoints, face_normals, sample_surface_evenly
+from handavatar.hand.pose import BONE_PARENTS, HandPose
+from handavatar.hand.pose_sampling import PENETRATION_LIMIT, PenetrationProbe, sample_poses
+from handavatar.hand.rig import Rig, ShapedHand
+
+_NUM_BALLS = 256
+_LEAST_RADIUS = 2e-3
+"""Metres; smaller ones lie at folds of the mesh."""
+_NUM_POSES = 384
+"""In which it is looked how near each other balls come without a part in another."""
+
+
+@dataclass(frozen=True, eq=False)
+class Balls:
+    """Balls inside a rig's template, each midway between a point of the skin and the one opposite.
+
+    Attributes:
+        near: a point of the skin.
+        opposite: where the line from there, straight into the hand, comes out again.
+        pairs: which balls cannot be in the same place: those of bones that are not connected.
+        reach: how far apart the middles of each pair are, metres, where they touch.
+    """
+
+    near: SurfacePoints
+    opposite: SurfacePoints
+    pairs: Int[Tensor, "pairs 2"]
+    reach: Float[Tensor, "pairs"]
+
+    def middles(self, vertices: Float[Tensor, "vertices 3"]) -> Float[Tensor, "balls 3"]:
+        """Of a posed hand's balls, metres."""
+        return (self.near.positions(vertices) + self.opposite.positions(vertices)) / 2
+
+
+@lru_cache(maxsize=4)
+def fill_with_balls(rig: Rig) -> Balls:
+    """The balls of a rig; the same ones every time."""
+    vertices, faces = rig.template_vertices, rig.faces
+    generator = torch.Generator().manual_seed(0)
+    near = sample_surface_evenly(vertices, faces, _NUM_BALLS, generator)
+    opposite, is_found = _opposite(vertices, faces, near)
+    middles = (near.positions(vertices) + opposite.positions(vertices)) / 2
+    radii = closest_on_mesh(vertices, faces, middles).distances
+    kept = is_found & (radii > _LEAST_RADIUS)
+    near = SurfacePoints(near.faces[kept], near.barycentric[kept])
+    opposite = SurfacePoints(opposite.faces[kept], opposite.barycentric[kept])
+    middles, radii = middles[kept], radii[kept]
+    weights = near.positions(rig.skin_weights) + opposite.positions(rig.skin_weights)
+    bones = weights.argmax(-1)
+    parents = torch.tensor(BONE_PARENTS)[bones]
+    is_child = parents[:, None] == bones
+    is_connected = (bones[:, None] == bones) | is_child | is_child.T
+    pairs = (~is_connected).triu(1).nonzero()
+    balls = Balls(near, opposite, pairs, radii[pairs].sum(-1))
+    return replace(balls, reach=balls.reach.minimum(_nearest(rig, balls, generator)))
+
+
+def _nearest(rig: Rig, balls: Balls, generator: torch.Generator) -> Float[Tensor, "pairs"]:
+    """How near the balls of each pair come in poses that hands can take: flesh gives way."""
+    rotations = sample_poses(rig, _NUM_POSES, generator)
+    can_be = PenetrationProbe(rig).depths(rotations) < PENETRATION_LIMIT
+    rotations = torch.cat([torch.zeros_like(rotations[:1]), rotations[can_be]])
+    hand = rig.shaped()
+    nearest = torch.full((len(balls.pairs),), torch.inf)
+    first, second = balls.pairs.unbind(-1)
+    for rotation in rotations:
+        middles = balls.middles(hand.posed(HandPose(rotation, torch.zeros(3))).vertices)
+        nearest = nearest.minimum((middles[first] - middles[second]).norm(dim=-1))
+    return nearest
+
+
+def overlaps(
+    balls: Balls, hand: ShapedHand, space: ShapeSpace, skeleton: Skeleton
+) -> tuple[Float[Tensor, "overlaps"], Float[Tensor, "overlaps unknowns"]]:
+    """By how much balls overlap, metres, and how that moves with a pose and the hand's shape.
+
+    Args:
+        balls: of the rig.
+        hand: rest hand.
+        space: how its shape moves.
+        skeleton: of the posed hand.
+    """
+    sides = [
+        RestPoints(
+            side.positions(hand.rest_vertices),
+            side.positions(hand.rig.skin_weights),
+            side.positions(space.directions.flatten(1)).unflatten(1, space.directions.shape[1:]),
+        )
+        for side in (balls.near, balls.opposite)
+    ]
+    middles = sum(skeleton.positions(side) for side in sides) / 2
+    first, second = balls.pairs.unbind(-1)
+    between = middles[first] - middles[second]
+    depth = balls.reach - between.norm(dim=-1)
+    touching = (depth > 0).nonzero()[:, 0]
+    involved, places = balls.pairs[touching].unique(return_inverse=True)
+    parts = [
+        RestPoints(side.positions[involved], side.skin_weights[involved], side.directions[involved])
+        for side in sides
+    ]
+    moving = sum(skeleton.jacobian(part) for part in parts) / 2
+    towards = normalize(between[touching], dim=-1)
+    slope = moving[places[:, 0]] - moving[places[:, 1]]
+    return depth[touching], -(towards[:, None] @ slope)[:, 0]
+
+
+def _opposite(
+    vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"], near: SurfacePoints
+) -> tuple[SurfacePoints, Bool[Tensor, "near"]]:
+    """Where lines straight into the mesh come out of it first, and whether they do."""
+    origins = near.positions(vertices)
+    inwards = -face_normals(vertices, near.faces)
+    corner, *others = vertices[faces].unbind(1)
+    along, across = (other - corner for other in others)
+    # Moeller and Trumbore's test of every line with every face.
+    normal = torch.linalg.cross(inwards[:, None], across[None])
+    slant = (along * normal).sum(-1)
+    from_corner = origins[:, None] - corner
+    second = (from_corner * normal).sum(-1) / slant
+    turned = torch.linalg.cross(from_corner, along[None].expand_as(from_corner))
+    third = (inwards[:, None] * turned).sum(-1) / slant
+    distance = (across * turned).sum(-1) / slant
+    is_hit = (second >= 0) & (third >= 0) & (second + third <= 1) & (distance > 1e-4)
+    nearest = torch.where(is_hit, distance, torch.inf).argmin(1)
+    row = torch.arange(len(origins))
+    second, third = second[row, nearest], third[row, nearest]
+    barycentric = torch.stack([1 - second - third, second, third], dim=-1)
+    return SurfacePoints(faces[nearest], barycentric), is_hit[row, nearest]
