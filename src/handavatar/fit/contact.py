@@ -104,7 +104,7 @@ def overlaps(
         )
         for side in (balls.near, balls.opposite)
     ]
-    middles = sum(skeleton.positions(side) for side in sides) / 2
+    middles = torch.stack([skeleton.positions(side) for side in sides]).mean(0)
     first, second = balls.pairs.unbind(-1)
     between = middles[first] - middles[second]
     depth = balls.reach - between.norm(dim=-1)
@@ -114,7 +114,7 @@ def overlaps(
         RestPoints(side.positions[involved], side.skin_weights[involved], side.directions[involved])
         for side in sides
     ]
-    moving = sum(skeleton.jacobian(part) for part in parts) / 2
+    moving = torch.stack([skeleton.jacobian(part) for part in parts]).mean(0)
     towards = normalize(between[touching], dim=-1)
     slope = moving[places[:, 0]] - moving[places[:, 1]]
     return depth[touching], -(towards[:, None] @ slope)[:, 0]

@@ -57,8 +57,9 @@ class EnergyOptions:
     """Weight of the details that a picture of the hand has room for, each of a blurred pixel."""
     contact_error: float = 3e-3
     """Metres that a hand sinks into itself, beyond what flesh gives; infinite lets it pass."""
-    landmark_outlier: float = 3.0
-    """Standard deviations beyond which a landmark is misplaced."""
+    landmark_outlier: float = 8.0
+    """Standard deviations beyond which a landmark is misplaced: where a finger lies on the palm
+    the outline says nothing, and would be let to have its way."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,6 +49,8 @@ _LEAST_TEXTURE_ERROR = 0.01
 """Of logarithms of colours: a step of eight bits, and a little noise."""
 _MILLIMETRES_PER_DEGREE = 0.5
 """A tracker that is off by some degrees is off by as many half millimetres, each way."""
+_SHARED_ERRORS = 0.1
+"""Of what a frame says about the shape, so much stands for errors that all frames share."""
 _LEAST_ERROR, _MOST_ERROR = 0.5, 12.0
 """Degrees."""
 
@@ -179,7 +181,9 @@ def _register(
         )
         return HandPoints(shaped, space, surface, landmarks)
 
-    sigmas = torch.cat([space.sigmas, offset_tolerances()]) if has_landmarks else space.sigmas
+    # The frames share their errors (one rig, one way to cut out hands): shape has to be worth it.
+    space_sigmas = space.sigmas / max(1.0, _SHARED_ERRORS * len(observations)) ** 0.5
+    sigmas = torch.cat([space_sigmas, offset_tolerances()]) if has_landmarks else space_sigmas
     shared = torch.zeros(len(sigmas))
     if start is not None:
         shared[num_shapes:] = start
