@@ -95,9 +95,7 @@ def test_slopes_are_those_of_the_depths(open_hand: Rig, balls: Balls) -> None:
     touching = here > _TOUCHING
     assert len(jacobian) == touching.sum() > 20
     step = 3e-3
-    ends = [
-        _all_depths(balls, hand, moved_pose(pose, sign * step * direction)) for sign in (1, -1)
-    ]
+    ends = [_all_depths(balls, hand, moved_pose(pose, sign * step * direction)) for sign in (1, -1)]
     slope = ((ends[0] - ends[1]) / (2 * step))[touching]
     torch.testing.assert_close(jacobian[:, :51] @ direction, slope, rtol=0.02, atol=2e-4)
     shapes = torch.randn(len(space.sigmas), generator=generator) * space.sigmas * 1e-2
