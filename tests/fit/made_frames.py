@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from handavatar.fit.contact import fill_with_balls
 from handavatar.fit.energy import HandPoints, Observation
 from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, moved_pose
 from handavatar.fit.pictures import FramePicture
@@ -107,7 +108,7 @@ def points_on(hand: ShapedHand, space: ShapeSpace | None = None, count: int = 15
     rig = hand.rig
     generator = torch.Generator().manual_seed(0)
     surface = sample_surface_evenly(rig.template_vertices, rig.faces, count, generator)
-    return HandPoints(hand, space or fixed_shape(rig), surface, NO_POINTS)
+    return HandPoints(hand, space or fixed_shape(rig), surface, fill_with_balls(rig), NO_POINTS)
 
 
 def scribble(

@@ -5,7 +5,6 @@ from dataclasses import replace
 import pytest
 import torch
 from made_frames import (
-    NO_POINTS,
     calm_poses,
     camera_over,
     moved_by,
@@ -33,12 +32,12 @@ def _descent(
     is_sequence: bool = False,
 ) -> Descent:
     space = space or fixed_shape(hand.rig)
-    surface = points_on(hand, count=600).surface
+    drawn = points_on(hand, count=600)
     sigma = torch.full((NUM_UNKNOWNS,), degrees / 57.3 / 3**0.5)
     sigma[-3:] = 0.5e-3 * degrees
 
     def points_of(shared: torch.Tensor, frame: int) -> HandPoints:
-        return HandPoints(space.shaped(hand, shared), space, surface, NO_POINTS)
+        return replace(drawn, hand=space.shaped(hand, shared), space=space)
 
     return Descent(
         observations=observations,

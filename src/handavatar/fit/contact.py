@@ -7,6 +7,7 @@ behind it. Only what a body is tells such poses apart.
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
+import igl
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -23,6 +24,8 @@ from handavatar.hand.rig import Rig, ShapedHand
 _NUM_BALLS = 256
 _LEAST_RADIUS = 2e-3
 """Metres; smaller ones lie at folds of the mesh."""
+_LIFT = 1e-4
+"""Metres inside of the skin from where the skin opposite is looked for."""
 _NUM_POSES = 384
 """In which it is looked how near each other balls come without a part in another."""
 
@@ -47,6 +50,11 @@ class Balls:
         """Of a posed hand's balls, metres."""
         return (self.near.positions(vertices) + self.opposite.positions(vertices)) / 2
 
+    def distances(self, vertices: Float[Tensor, "vertices 3"]) -> Float[Tensor, "pairs"]:
+        """Between the middles of each pair in a posed hand, metres."""
+        first, second = self.middles(vertices)[self.pairs].unbind(1)
+        return (first - second).norm(dim=-1)
+
 
 @lru_cache(maxsize=4)
 def fill_with_balls(rig: Rig) -> Balls:
@@ -58,9 +66,7 @@ def fill_with_balls(rig: Rig) -> Balls:
     middles = (near.positions(vertices) + opposite.positions(vertices)) / 2
     radii = closest_on_mesh(vertices, faces, middles).distances
     kept = is_found & (radii > _LEAST_RADIUS)
-    near = SurfacePoints(near.faces[kept], near.barycentric[kept])
-    opposite = SurfacePoints(opposite.faces[kept], opposite.barycentric[kept])
-    middles, radii = middles[kept], radii[kept]
+    near, opposite, radii = near.chosen(kept), opposite.chosen(kept), radii[kept]
     weights = near.positions(rig.skin_weights) + opposite.positions(rig.skin_weights)
     bones = weights.argmax(-1)
     parents = torch.tensor(BONE_PARENTS)[bones]
@@ -74,14 +80,12 @@ def fill_with_balls(rig: Rig) -> Balls:
 def _nearest(rig: Rig, balls: Balls, generator: torch.Generator) -> Float[Tensor, "pairs"]:
     """How near the balls of each pair come in poses that hands can take: flesh gives way."""
     rotations = sample_poses(rig, _NUM_POSES, generator)
-    can_be = PenetrationProbe(rig).depths(rotations) < PENETRATION_LIMIT
-    rotations = torch.cat([torch.zeros_like(rotations[:1]), rotations[can_be]])
-    hand = rig.shaped()
-    nearest = torch.full((len(balls.pairs),), torch.inf)
-    first, second = balls.pairs.unbind(-1)
-    for rotation in rotations:
-        middles = balls.middles(hand.posed(HandPose(rotation, torch.zeros(3))).vertices)
-        nearest = nearest.minimum((middles[first] - middles[second]).norm(dim=-1))
+    hands = rig.shaped().posed(HandPose(rotations, torch.zeros(_NUM_POSES, 3))).vertices
+    probe = PenetrationProbe(rig)
+    nearest = balls.distances(rig.template_vertices)
+    for vertices in hands:
+        if probe.depth(vertices) < PENETRATION_LIMIT:
+            nearest = nearest.minimum(balls.distances(vertices))
     return nearest
 
 
@@ -96,22 +100,17 @@ def overlaps(
         space: how its shape moves.
         skeleton: of the posed hand.
     """
-    sides = [
-        RestPoints(
-            side.positions(hand.rest_vertices),
-            side.positions(hand.rig.skin_weights),
-            side.positions(space.directions.flatten(1)).unflatten(1, space.directions.shape[1:]),
-        )
-        for side in (balls.near, balls.opposite)
-    ]
-    middles = torch.stack([skeleton.positions(side) for side in sides]).mean(0)
+    sides = (balls.near, balls.opposite)
+    still = space.directions[..., :0]
+    rest = [RestPoints.between(side.positions, hand, still) for side in sides]
+    middles = torch.stack([skeleton.positions(side) for side in rest]).mean(0)
     first, second = balls.pairs.unbind(-1)
     between = middles[first] - middles[second]
     depth = balls.reach - between.norm(dim=-1)
     touching = (depth > 0).nonzero()[:, 0]
     involved, places = balls.pairs[touching].unique(return_inverse=True)
     parts = [
-        RestPoints(side.positions[involved], side.skin_weights[involved], side.directions[involved])
+        RestPoints.between(side.chosen(involved).positions, hand, space.directions)
         for side in sides
     ]
     moving = torch.stack([skeleton.jacobian(part) for part in parts]).mean(0)
@@ -124,21 +123,15 @@ def _opposite(
     vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"], near: SurfacePoints
 ) -> tuple[SurfacePoints, Bool[Tensor, "near"]]:
     """Where lines straight into the mesh come out of it first, and whether they do."""
-    origins = near.positions(vertices)
     inwards = -face_normals(vertices, near.faces)
-    corner, *others = vertices[faces].unbind(1)
-    along, across = (other - corner for other in others)
-    # Moeller and Trumbore's test of every line with every face.
-    normal = torch.linalg.cross(inwards[:, None], across[None])
-    slant = (along * normal).sum(-1)
-    from_corner = origins[:, None] - corner
-    second = (from_corner * normal).sum(-1) / slant
-    turned = torch.linalg.cross(from_corner, along[None].expand_as(from_corner))
-    third = (inwards[:, None] * turned).sum(-1) / slant
-    distance = (across * turned).sum(-1) / slant
-    is_hit = (second >= 0) & (third >= 0) & (second + third <= 1) & (distance > 1e-4)
-    nearest = torch.where(is_hit, distance, torch.inf).argmin(1)
-    row = torch.arange(len(origins))
-    second, third = second[row, nearest], third[row, nearest]
-    barycentric = torch.stack([1 - second - third, second, third], dim=-1)
-    return SurfacePoints(faces[nearest], barycentric), is_hit[row, nearest]
+    # Not from the face itself.
+    starts = (near.positions(vertices) + _LIFT * inwards).double().numpy()
+    places, all_faces = vertices.double().numpy(), faces.numpy()
+    hit_faces, weights, is_found = [], [], []
+    for start, inward in zip(starts, inwards.double().numpy(), strict=True):
+        hits = igl.ray_mesh_intersect(start, inward, places, all_faces)
+        face, _, second, third = hits[0] if hits else (0, 0.0, 0.0, 0.0)
+        hit_faces.append(face)
+        weights.append([1 - second - third, second, third])
+        is_found.append(bool(hits))
+    return SurfacePoints(faces[hit_faces], torch.tensor(weights)), torch.tensor(is_found)

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from handavatar.fit.appearance import SkinTexture, look_up_points
-from handavatar.fit.contact import fill_with_balls, overlaps
+from handavatar.fit.contact import Balls, overlaps
 from handavatar.fit.kinematics import (
     NUM_UNKNOWNS,
     RestPoints,
@@ -29,7 +29,7 @@ from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import ShapedHand
-from handavatar.render.silhouette import OutlinePoints, outline_points
+from handavatar.render.silhouette import outline_points
 
 VIDEO_TEXTURE_SHARE = 2.0
 """Weight of details in frames of a video: what tracked poses are off by lasts from frame to frame
@@ -117,6 +117,7 @@ class HandPoints:
         hand: rest hand.
         space: shared unknowns of its shape.
         surface: points whose texture is compared.
+        balls: that fill it.
         landmarks: what a tracker's landmarks are on the rest hand; no points without a tracker.
             Their directions are those of the shape and then of each landmark's own offset.
     """
@@ -124,6 +125,7 @@ class HandPoints:
     hand: ShapedHand
     space: ShapeSpace
     surface: SurfacePoints
+    balls: Balls
     landmarks: RestPoints
 
     @property
@@ -181,10 +183,7 @@ def linearise_frame(
             options,
         )
     if math.isfinite(options.contact_error):
-        depths, jacobian = overlaps(fill_with_balls(hand.rig), hand, points.space, skeleton)
-        ones = torch.ones_like(depths)
-        sunk = options.contact_error
-        total.add(depths / sunk, jacobian / sunk, ones, math.inf)
+        _add_contact(total, points, hand, skeleton, options)
     if seen.landmarks is not None:
         _add_landmarks(total, points, skeleton, seen.picture.camera, seen.landmarks, options)
     return Linearised(total.hessian, total.gradient, total.energy)
@@ -243,7 +242,7 @@ def _add_outlines(
     outline = outline_points(vertices, hand.rig.faces, drawing_camera(camera))
     if len(outline.ends) == 0:
         return
-    rest = _outline_rest(points, hand, outline)
+    rest = RestPoints.between(outline.of, hand, points.space.directions)
     positions = skeleton.positions(rest)
     pixels, _, moving = pixel_jacobian(camera, positions)
     values, slopes = band.sample(pixels)
@@ -270,26 +269,12 @@ def _add_outlines(
     total.add(across / unit, jacobian / unit, weights, far, apart.norm(dim=-1) / unit)
 
 
-def _outline_rest(points: HandPoints, hand: ShapedHand, outline: OutlinePoints) -> RestPoints:
-    directions = points.space.directions
-    return RestPoints(
-        outline.of(hand.rest_vertices),
-        outline.of(hand.rig.skin_weights),
-        outline.of(directions.flatten(1)).unflatten(1, directions.shape[1:]),
-    )
-
-
 def surface_rest(
     points: HandPoints, hand: ShapedHand, index: Int[Tensor, "selected"]
 ) -> RestPoints:
     """Some points of the surface, at rest."""
-    corners = SurfacePoints(points.surface.faces[index], points.surface.barycentric[index])
-    directions = points.space.directions
-    return RestPoints(
-        corners.positions(hand.rest_vertices),
-        corners.positions(hand.rig.skin_weights),
-        corners.positions(directions.flatten(1)).unflatten(1, directions.shape[1:]),
-    )
+    chosen = points.surface.chosen(index)
+    return RestPoints.between(chosen.positions, hand, points.space.directions)
 
 
 def _add_texture(
@@ -328,6 +313,19 @@ def _add_texture(
         options.texture_outlier,
         distance.flatten(),
     )
+
+
+def _add_contact(
+    total: _Sum,
+    points: HandPoints,
+    hand: ShapedHand,
+    skeleton: Skeleton,
+    options: EnergyOptions,
+) -> None:
+    """The hand does not sink into itself."""
+    depths, jacobian = overlaps(points.balls, hand, points.space, skeleton)
+    error = options.contact_error
+    total.add(depths / error, jacobian / error, torch.ones_like(depths), math.inf)
 
 
 def _add_landmarks(

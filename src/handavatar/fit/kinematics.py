@@ -6,6 +6,7 @@ bones (radians) and the shift of the wrist (metres) are the 51 unknowns of a fra
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -19,6 +20,8 @@ from handavatar.hand.rig import ShapedHand
 
 NUM_UNKNOWNS = 3 * NUM_BONES + 3
 """Of one frame."""
+Interpolate = Callable[[Float[Tensor, "vertices channels"]], Float[Tensor, "points channels"]]
+"""Takes values of a mesh's vertices to some points of it."""
 
 
 def moved_pose(pose: HandPose, change: Float[Tensor, "*batch 51"]) -> HandPose:
@@ -58,6 +61,23 @@ class RestPoints:
     positions: Float[Tensor, "points 3"]
     skin_weights: Float[Tensor, "points bones"]
     directions: Float[Tensor, "points 3 shapes"]
+
+    @staticmethod
+    def between(
+        interpolate: Interpolate, hand: ShapedHand, directions: Float[Tensor, "vertices 3 shapes"]
+    ) -> "RestPoints":
+        """Points between the vertices of a rest hand.
+
+        Args:
+            interpolate: values of the vertices, at the points.
+            hand: rest hand.
+            directions: how its vertices move with the shape, metres.
+        """
+        return RestPoints(
+            interpolate(hand.rest_vertices),
+            interpolate(hand.rig.skin_weights),
+            interpolate(directions.flatten(1)).unflatten(1, directions.shape[1:]),
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.fit.appearance import SkinTexture, fit_texture, look_up_points
+from handavatar.fit.contact import fill_with_balls
 from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
 from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, moved_pose, pose_difference
 from handavatar.fit.landmarks import landmark_rest, offset_tolerances
@@ -170,7 +171,7 @@ def _register(
     rig = hands[0].rig
     space = ShapeSpace.around(rig, options.coefficient_sigma) if learns_shape else fixed_shape(rig)
     generator = torch.Generator().manual_seed(options.seed)
-    surface = _compared_points(rig)
+    surface, balls = _compared_points(rig), fill_with_balls(rig)
     has_landmarks = any(seen.landmarks is not None for seen in observations)
     num_shapes = len(space.sigmas)
 
@@ -179,7 +180,7 @@ def _register(
         landmarks = (
             landmark_rest(shaped, space, shared[num_shapes:]) if has_landmarks else _NO_LANDMARKS
         )
-        return HandPoints(shaped, space, surface, landmarks)
+        return HandPoints(shaped, space, surface, balls, landmarks)
 
     # The frames share their errors (one rig, one way to cut out hands): shape has to be worth it.
     space_sigmas = space.sigmas / max(1.0, _SHARED_ERRORS * len(observations)) ** 0.5
@@ -273,6 +274,7 @@ def follow_picture(
         The pose to begin with, unless outline and texture agree better with another one.
     """
     surface, space = _compared_points(hand.rig), fixed_shape(hand.rig)
+    points = HandPoints(hand, space, surface, fill_with_balls(hand.rig), _NO_LANDMARKS)
     start = HandPose(pose.rotations[None], pose.translation[None])
     with one_thread():
         descent = Descent(
@@ -280,7 +282,7 @@ def follow_picture(
             times=torch.zeros(1),
             tracked=start,
             information=information[None],
-            points_of=lambda shared, frame: HandPoints(hand, space, surface, _NO_LANDMARKS),
+            points_of=lambda shared, frame: points,
             shared_sigmas=space.sigmas,
             options=options.energy,
             is_sequence=False,

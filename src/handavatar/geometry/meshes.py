@@ -156,6 +156,12 @@ class SurfacePoints:
         corners = vertices[..., self.faces, :]
         return (corners * self.barycentric[..., None]).sum(-2)
 
+    def chosen(
+        self, which: Int[Tensor, "chosen"] | Bool[Tensor, "points"] | slice
+    ) -> "SurfacePoints":
+        """Some of the points."""
+        return SurfacePoints(self.faces[which], self.barycentric[which])
+
 
 def sample_surface(
     vertices: Float[Tensor, "vertices 3"],
@@ -202,7 +208,7 @@ def sample_surface_evenly(
         offset = torch.addmv(squares, positions, positions[last], alpha=-2) + squares[last]
         torch.minimum(nearest, offset, out=nearest)
         chosen[index] = nearest.argmax()
-    return SurfacePoints(candidates.faces[chosen], candidates.barycentric[chosen])
+    return candidates.chosen(chosen)
 
 
 def winding_number(

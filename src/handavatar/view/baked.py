@@ -18,7 +18,6 @@ from handavatar.field.anchors import nearest_anchors
 from handavatar.field.shape import personal_hand
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import (
-    SurfacePoints,
     carried_to_fine,
     subdivision_levels,
     vertex_normals,
@@ -76,9 +75,9 @@ class BakedAvatar:
         places = self._anchors.positions(template)
         every = max(len(places) // NUM_LIT, 1)
         lit = places[::every]
-        self._lit = SurfacePoints(self._anchors.faces[::every], self._anchors.barycentric[::every])
+        self._lit = self._anchors.chosen(slice(None, None, every))
         every = max(len(lit) // NUM_PROBES, 1)
-        self._probes = SurfacePoints(self._lit.faces[::every], self._lit.barycentric[::every])
+        self._probes = self._lit.chosen(slice(None, None, every))
         with torch.no_grad():
             self._at_vertices = nearest_anchors(places, template)
             self._at_lit = nearest_anchors(places, lit)
