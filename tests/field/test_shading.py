@@ -1,5 +1,7 @@
 """Directed soft occupancy, albedo and illumination."""
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -99,3 +101,32 @@ def test_oriented_light_depends_on_the_normal_and_a_pose_per_query_is_the_same_p
     light = field(flat, there, clear, up, NO_LIGHT)
     assert not torch.allclose(light, field(flat, there, clear, -up, NO_LIGHT))
     assert torch.equal(light, field(flat.expand(6, -1, -1), there, clear, up, NO_LIGHT))
+
+
+def test_a_wrist_half_a_turn_away_is_one_input_whichever_vector_means_it() -> None:
+    torch.manual_seed(0)
+    field = IlluminationField(torch.rand(50, 3), PaperCues())
+    others = _neighbours(), torch.rand(6, NUM_BONES), torch.rand(6, 3), NO_LIGHT
+    pose = 0.2 * torch.randn(NUM_BONES, 3)
+    axis = torch.tensor([0.6, 0.0, 0.8])
+    just_before, just_after = pose.clone(), pose.clone()
+    just_before[0], just_after[0] = 3.1 * axis, (3.2 - 2 * math.pi) * axis
+    with torch.no_grad():
+        shades = [field(just_before, *others), field(just_after, *others)]
+    # Without a reference the two lie on opposite sides.
+    assert float((shades[0] - shades[1]).abs().max()) > 1e-2
+    field.wrist_reference.copy_(3 * axis)
+    with torch.no_grad():
+        shades = [field(just_before, *others), field(just_after, *others)]
+    assert float((shades[0] - shades[1]).abs().max()) < 5e-3
+    rotated = pose.expand(6, -1, -1).clone()
+    rotated[:, 0] = just_after[0]
+    torch.testing.assert_close(field(rotated, *others), shades[1])
+
+
+def test_weights_of_before_there_was_a_reference_are_read() -> None:
+    field = IlluminationField(torch.rand(50, 3), PaperCues())
+    field.wrist_reference.fill_(1.0)
+    old = {k: v for k, v in field.state_dict().items() if k != "wrist_reference"}
+    field.load_state_dict(old)
+    assert torch.equal(field.wrist_reference, torch.zeros(3))

@@ -12,6 +12,8 @@ from handavatar.geometry.rotations import (
     invert_rigid,
     left_jacobian,
     matrix_from_axis_angle,
+    mean_rotation,
+    nearest_rotations,
     quaternion_from_matrix,
     rigid_transform,
     skew,
@@ -103,3 +105,25 @@ def test_rigid_transforms_compose_and_invert() -> None:
     torch.testing.assert_close(apply_rigid(a @ b, points), apply_rigid(a, apply_rigid(b, points)))
     torch.testing.assert_close(apply_rigid(invert_rigid(a), apply_rigid(a, points)), points)
     torch.testing.assert_close(invert_rigid(a), torch.linalg.inv(a))
+
+
+def test_nearest_rotations_mean_the_same_and_lie_nearer() -> None:
+    given, reference = _axis_angles(), _axis_angles().roll(7, 0)
+    found = nearest_rotations(given, reference)
+    torch.testing.assert_close(matrix_from_axis_angle(found), matrix_from_axis_angle(given))
+    assert bool(((found - reference).norm(dim=-1) <= (given - reference).norm(dim=-1)).all())
+    assert bool((found != given).any()) and bool((found == given).all(-1).any())
+    # Nearest to none at all: at most half a turn.
+    turned = torch.tensor([[0.0, 4.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
+    expected = torch.tensor([[0.0, 4.0 - 2 * math.pi, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
+    torch.testing.assert_close(nearest_rotations(turned, torch.zeros(3)), expected)
+
+
+def test_the_mean_rotation_agrees_with_scipy() -> None:
+    middle = Rotation.from_rotvec([1.5, -2.0, 1.6])
+    generator = torch.Generator().manual_seed(1)
+    turns = 0.5 * torch.randn(40, 3, generator=generator, dtype=torch.float64)
+    given = (middle * Rotation.from_rotvec(turns.numpy())).as_rotvec()
+    found = mean_rotation(torch.from_numpy(given))
+    expected = torch.from_numpy(Rotation.from_rotvec(given).mean().as_rotvec())
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)

@@ -19,6 +19,7 @@ from safetensors.torch import load_file
 from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar
 from handavatar.capture.frames import CaptureError, read_capture
 from handavatar.evaluate.perceptual import perceptual_loss
+from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.rig import RigError
 from handavatar.train import loop
 from handavatar.train.loop import (
@@ -111,7 +112,9 @@ def test_a_step_changes_all_but_the_frozen_encoder(tiny_capture: Path) -> None:
     changed = {n for n, value in avatar.state_dict().items() if not torch.equal(value, before[n])}
     fixed = {name for name in before if name.startswith("occupancy.encoder")}
     fixed |= {"coefficients", "anchor_corners", "anchor_barycentric"}
-    fixed |= {"illumination.position_codes"}
+    fixed |= {"illumination.position_codes", "illumination.wrist_reference"}
+    reference = matrix_from_axis_angle(avatar.illumination.wrist_reference)
+    torch.testing.assert_close(reference, matrix_from_axis_angle(frames[0].pose.rotations[0]))
     assert not changed & fixed
     for part in ("shape", "occupancy.decoder", "albedo.codes", "albedo.mlp", "illumination.mlp"):
         assert any(name.startswith(part) for name in changed), part

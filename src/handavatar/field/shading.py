@@ -1,6 +1,7 @@
 """The self-occlusion-aware shading field ("SelF"): albedo and illumination."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -9,6 +10,7 @@ from torch import Tensor, nn
 from handavatar.field.anchors import Neighbours
 from handavatar.field.layers import MLP, positional_encoding
 from handavatar.field.texture import detailed
+from handavatar.geometry.rotations import nearest_rotations
 
 NUM_FREQUENCIES = 3
 CODE_WIDTH = 128
@@ -174,6 +176,7 @@ class IlluminationField(nn.Module):
 
     position_codes: Tensor
     directions: Tensor
+    wrist_reference: Tensor
 
     def __init__(self, anchor_positions: Float[Tensor, "anchors 3"], chosen: CueSet) -> None:
         """Fixes the encodings E of the anchors' template positions (metres).
@@ -186,8 +189,16 @@ class IlluminationField(nn.Module):
         centred = (anchor_positions - anchor_positions.mean(0)) / POSITION_SCALE
         self.register_buffer("position_codes", positional_encoding(centred, NUM_FREQUENCIES))
         self.register_buffer("directions", torch.zeros(chosen.num_directions, 3))
+        self.register_buffer("wrist_reference", torch.zeros(3))
         self.chosen = chosen
         self.mlp = MLP(chosen.width, chosen.hidden[0], len(chosen.hidden), 1)
+
+    def _load_from_state_dict(
+        self, state_dict: dict[str, Any], prefix: str, *others: Any, **more: Any
+    ) -> None:
+        """Weights of before there was a reference mean rotations of at most half a turn."""
+        state_dict.setdefault(f"{prefix}wrist_reference", torch.zeros(3))
+        super()._load_from_state_dict(state_dict, prefix, *others, **more)
 
     def forward(
         self,
@@ -208,9 +219,14 @@ class IlluminationField(nn.Module):
             light: what lights in ``directions`` bring; no columns where the cues know none.
 
         Departs: the authors give the wrist's rotation in camera axes, which cannot tell where a
-            light that is fixed in the world stands; here it is the world's.
+            light that is fixed in the world stands; here it is the world's. Of the two vectors
+            that mean the same rotation, the network gets the one that is nearer to
+            ``wrist_reference``: hands that are seen half a turn from their rest would else jump
+            between two inputs.
         """
         places = neighbours.interpolated(self.position_codes)
-        pose = rotations.flatten(-2).expand(len(places), -1)
+        wrist = nearest_rotations(rotations[..., :1, :], self.wrist_reference)
+        pose = torch.cat([wrist, rotations[..., 1:, :]], dim=-2)
+        pose = pose.flatten(-2).expand(len(places), -1)
         inputs = self.chosen(Cues(pose, places, directed, normals.detach(), light.detach()))
         return self.mlp(inputs)[:, 0].sigmoid()

@@ -5,7 +5,6 @@ of one size means the same angle whatever the pose, which axis-angle vectors do 
 bones (radians) and the shift of the wrist (metres) are the 51 unknowns of a frame, in this order.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -36,16 +35,6 @@ def pose_difference(start: HandPose, end: HandPose) -> Float[Tensor, "*batch 51"
     between = matrix_from_axis_angle(start.rotations).mT @ matrix_from_axis_angle(end.rotations)
     turns = axis_angle_from_matrix(between).flatten(-2)
     return torch.cat([turns, end.translation - start.translation], dim=-1)
-
-
-def nearest_rotations(
-    rotations: Float[Tensor, "*n 3"], reference: Float[Tensor, "*n 3"]
-) -> Float[Tensor, "*n 3"]:
-    """The same rotations as the axis-angle vectors nearest to others: a half turn has two."""
-    angle = rotations.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-    other = rotations * (1 - 2 * math.pi / angle)
-    is_nearer = (other - reference).norm(dim=-1) < (rotations - reference).norm(dim=-1)
-    return torch.where(is_nearer[..., None], other, rotations)
 
 
 @dataclass(frozen=True, eq=False)

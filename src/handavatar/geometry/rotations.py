@@ -4,6 +4,8 @@ One convention: right-handed rotations acting on column vectors, angles in radia
 ``target_from_source`` matrices, so that products read by touching names.
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -82,6 +84,31 @@ def axis_angle_from_matrix(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor,
         is_small, torch.full_like(sine, 2.0), angle / sine.clamp_min(torch.finfo(sine.dtype).tiny)
     )
     return ratio * xyz
+
+
+def nearest_rotations(
+    rotations: Float[Tensor, "*n 3"], reference: Float[Tensor, "*#n 3"]
+) -> Float[Tensor, "*n 3"]:
+    """The same rotations as the axis-angle vectors nearest to others: a half turn has two."""
+    angle = rotations.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+    other = rotations * (1 - 2 * math.pi / angle)
+    is_nearer = (other - reference).norm(dim=-1) < (rotations - reference).norm(dim=-1)
+    return torch.where(is_nearer[..., None], other, rotations)
+
+
+def mean_rotation(rotations: Float[Tensor, "rotations 3"]) -> Float[Tensor, "3"]:
+    """The rotation that is nearest to all, in the sum of squared differences of their matrices.
+
+    Args:
+        rotations: axis-angle, at least one.
+
+    Returns:
+        Axis-angle, at most half a turn.
+    """
+    left, _, right = torch.linalg.svd(matrix_from_axis_angle(rotations.double()).mean(0))
+    flip = torch.ones(3, dtype=torch.float64, device=rotations.device)
+    flip[2] = torch.linalg.det(left @ right).sign()
+    return axis_angle_from_matrix(left @ torch.diag(flip) @ right).to(rotations)
 
 
 def quaternion_from_matrix(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:

@@ -20,6 +20,7 @@ from handavatar.field.shading import CueSet, OrientedCues, PaperCues, TracedCues
 from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import is_inside
+from handavatar.geometry.rotations import mean_rotation
 from handavatar.hand.rigs import find_rig
 from handavatar.train.appearance import (
     SeenSamples,
@@ -400,6 +401,8 @@ def begin_training(
     avatar.start_from_color(
         mean_color([frame.colors for frame in frames], [frame.mask for frame in frames])
     )
+    wrists = torch.stack([frame.pose.rotations[0] for frame in frames])
+    avatar.illumination.wrist_reference.copy_(mean_rotation(wrists))
     avatar.occupancy.encoder.requires_grad_(False)
     is_corrected = capture.is_tracked and method.corrects_poses
     corrections = PoseCorrections(len(frames)) if is_corrected else None

@@ -9,8 +9,8 @@ from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
 from handavatar.capture.registration import poses_of, register_frames
 from handavatar.fit.energy import VIDEO_TEXTURE_SHARE
-from handavatar.fit.kinematics import nearest_rotations
 from handavatar.fit.register import Registered, RegisterOptions
+from handavatar.geometry.rotations import nearest_rotations
 from handavatar.hand.pose import HandPose
 from handavatar.train.corrections import PoseCorrections
 
