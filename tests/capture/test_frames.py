@@ -1,4 +1,5 @@
 import json
+import math
 import struct
 import zlib
 from dataclasses import replace
@@ -10,6 +11,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from safetensors.torch import load_file, save_file
 
 from handavatar.capture.frames import (
     CaptureError,
@@ -21,6 +23,7 @@ from handavatar.capture.frames import (
     read_capture,
     write_capture,
 )
+from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.geometry.cameras import Camera, look_at, project
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
@@ -370,9 +373,52 @@ def test_what_is_known_gains_and_covariances_come_back(tmp_path: Path) -> None:
         assert not bool(found.mask[:, :3].any()) and bool(found.mask.any())
 
 
+def sighting(index: int) -> LandmarkSightings:
+    generator = torch.Generator().manual_seed(index)
+    return LandmarkSightings(
+        torch.rand(21, 2, generator=generator),
+        torch.rand(21, generator=generator) + 0.1,
+        torch.rand(21, generator=generator),
+        torch.rand(21, generator=generator) + 0.1,
+        torch.rand(21, 3, generator=generator),
+    )
+
+
+def test_landmarks_come_back(tmp_path: Path) -> None:
+    frames = [replace(make_frame(index), landmarks=sighting(index)) for index in range(2)]
+    capture = write_capture(tmp_path / "c", frames, **HEADER)
+    for index, frame in enumerate(frames):
+        found = capture.frame(index).landmarks
+        for name in ("directions", "errors", "depths", "depth_errors", "offsets"):
+            assert torch.equal(getattr(found, name), getattr(frame.landmarks, name))
+    with pytest.raises(CaptureError, match="1 of 2 frames have landmarks"):
+        write_capture(tmp_path / "d", [frames[0], make_frame(1)], **HEADER)
+    assert not (tmp_path / "d").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"errors": torch.zeros(2, 21)}, "errors are not above zero"),
+        ({"depths": torch.full((2, 21), math.nan)}, "depths has shape .* not finite"),
+        ({"directions": torch.zeros(3, 21, 2)}, "directions has shape"),
+        ({"offsets": None}, "cannot be read"),
+    ],
+)
+def test_landmarks_that_do_not_fit_the_frames_are_refused(tmp_path: Path, change, what) -> None:
+    frames = [replace(make_frame(index), landmarks=sighting(index)) for index in range(2)]
+    capture = write_capture(tmp_path / "c", frames, **HEADER)
+    path = tmp_path / "c" / "landmarks.safetensors"
+    tensors = {k: v for k, v in (load_file(path) | change).items() if v is not None}
+    save_file(tensors, path)
+    with pytest.raises(CaptureError, match=what):
+        capture.frame(0)
+    assert any(what.split()[0] in problem.what for problem in find_problems(tmp_path / "c"))
+
+
 def test_captures_that_say_nothing_of_it_know_everything(tmp_path: Path) -> None:
     frame = write_capture(tmp_path / "c", [make_frame(0)], **HEADER).frame(0)
-    assert bool(frame.known.all()) and frame.covariance is None
+    assert bool(frame.known.all()) and frame.covariance is None and frame.landmarks is None
     assert torch.equal(frame.gain, torch.ones(3))
     assert not (tmp_path / "c" / "known").exists()
 

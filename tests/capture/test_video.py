@@ -29,6 +29,7 @@ from handavatar.capture.video import (
     summary_lines,
 )
 from handavatar.capture.windows import Window
+from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.geometry.cameras import project
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.rig import Rig
@@ -155,7 +156,11 @@ def _made_video(
     track = Track("right", tuple(hands), {}, size)
     covariances = (1e-6 * torch.eye(51)).expand(_MADE, -1, -1)
     errors = torch.full((_MADE,), 0.002)
-    fitted = FittedHands(several, torch.stack(vertices), errors, covariances)
+    nothing = torch.zeros(21)
+    sighting = LandmarkSightings(
+        torch.zeros(21, 2), nothing + 0.1, nothing, nothing + 0.1, torch.zeros(21, 3)
+    )
+    fitted = FittedHands(several, torch.stack(vertices), errors, covariances, [sighting] * _MADE)
     monkeypatch.setattr(video_module, "track_hand", lambda *_: track)
     monkeypatch.setattr(video_module, "video_frames", lambda *_: iter(()))
     monkeypatch.setattr(video_module, "_found_masks", lambda *_: [])

@@ -19,13 +19,12 @@ from handavatar.fit.appearance import SkinTexture, fit_texture, see_texture
 from handavatar.fit.energy import (
     EnergyOptions,
     HandPoints,
-    LandmarkSightings,
     Linearised,
     Observation,
     linearise_frame,
 )
 from handavatar.fit.kinematics import NUM_UNKNOWNS, Skeleton, moved_pose
-from handavatar.fit.landmarks import landmark_rest
+from handavatar.fit.landmarks import LandmarkSightings, landmark_rest
 from handavatar.fit.pictures import FramePicture
 from handavatar.fit.shape import ShapeSpace
 from handavatar.geometry.cameras import Camera, project
@@ -96,7 +95,14 @@ def _sightings(
     pixels = pixels + 3 * torch.randn(21, 2, generator=generator)
     depths = depths + 0.02 * torch.randn(21, generator=generator)
     errors = 1 + 2 * torch.rand(21, generator=generator)
-    return LandmarkSightings(pixels, errors, depths - depths.mean(), torch.full((21,), 0.02))
+    focal, center = torch.tensor(camera.focal), torch.tensor(camera.center)
+    return LandmarkSightings(
+        (pixels - center) / focal,
+        errors / focal[0],
+        depths - depths.mean(),
+        torch.full((21,), 0.02),
+        torch.zeros(21, 3),
+    )
 
 
 def _with_landmarks(points: HandPoints) -> HandPoints:

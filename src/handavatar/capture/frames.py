@@ -22,7 +22,7 @@ from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -42,6 +42,7 @@ from handavatar.capture.checks import (
     path_inside,
     text_field,
 )
+from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.rotations import invert_rigid
 from handavatar.hand.pose import NUM_BONES, HandPose
@@ -55,13 +56,24 @@ from handavatar.jobs.files import (
     swap_folder,
 )
 
+Said = TypeVar("Said")
+"""What a frame may say of itself."""
 SCHEMA = 1
 SPLITS = ("train", "val", "test")
 MAX_FRAMES = 100_000
 _UNKNOWN_GREY = 128
 COVARIANCES = "covariances.safetensors"
 """File of a capture: tensor ``covariance``, one matrix per frame, in the order of the frames."""
+LANDMARKS = "landmarks.safetensors"
+"""File of a capture: the fields of ``LandmarkSightings``, stacked in the order of the frames."""
 _MAKE_AGAIN = "make the capture again, or delete this file: poses then count as less sure"
+_LANDMARK_SHAPES: dict[str, tuple[int, ...]] = {
+    "directions": (21, 2),
+    "errors": (21,),
+    "depths": (21,),
+    "depth_errors": (21,),
+    "offsets": (21, 3),
+}
 
 
 def _is_older_capture(folder: Path) -> bool:
@@ -79,7 +91,8 @@ CAPTURE = FolderKind(
         "transforms.json",
         *("images/*.png", "masks/*.png", "known/*.png"),
         *("truth/*.png", "truth/*.json", "truth/*.safetensors"),
-        *("overview.png", "fit.json", "skipped.json", "seen.safetensors", COVARIANCES),
+        *("overview.png", "fit.json", "skipped.json", "seen.safetensors"),
+        *(COVARIANCES, LANDMARKS),
     ),
     _is_older_capture,
 )
@@ -107,7 +120,9 @@ class Frame:
             stored values of this picture larger than those of the capture's average; ones if it is
             left out.
         covariance: of the pose's errors, rotations bone by bone (radians) and then translation
-            (metres); None where the capture does not say.
+            (metres), as far as neither landmarks nor mask nor colours tell it; None where the
+            capture does not say.
+        landmarks: that a tracker saw; None where the capture does not say.
     """
 
     name: str
@@ -121,6 +136,7 @@ class Frame:
     known: Bool[Tensor, "height width"] = None  # type: ignore[assignment]
     gain: Float[Tensor, "3"] = None  # type: ignore[assignment]
     covariance: Float[Tensor, "51 51"] | None = None
+    landmarks: LandmarkSightings | None = None
 
     def __post_init__(self) -> None:
         """Fills in what most pictures need not say."""
@@ -251,6 +267,7 @@ class Capture:
             known=torch.from_numpy(known),
             gain=torch.tensor(record.gain),
             covariance=None if self.covariances is None else self.covariances[index],
+            landmarks=None if self.landmarks is None else self.landmarks[index],
         )
 
     @cached_property
@@ -260,20 +277,55 @@ class Capture:
         Raises:
             CaptureError: if the file does not fit the frames.
         """
-        path = self.folder / COVARIANCES
+        found = self._frame_tensors(COVARIANCES, {"covariance": (51, 51)})
+        return None if found is None else found["covariance"]
+
+    @cached_property
+    def landmarks(self) -> tuple[LandmarkSightings, ...] | None:
+        """Of every frame, as in :class:`Frame`; None where the capture does not say.
+
+        Raises:
+            CaptureError: if the file does not fit the frames.
+        """
+        found = self._frame_tensors(LANDMARKS, _LANDMARK_SHAPES)
+        if found is None:
+            return None
+        for name in ("errors", "depth_errors"):
+            if not bool((found[name] > 0).all()):
+                raise CaptureError(f"{LANDMARKS}: {name} are not above zero", _MAKE_AGAIN)
+        return tuple(
+            LandmarkSightings(**{name: values[index] for name, values in found.items()})
+            for index in range(len(self.records))
+        )
+
+    def _frame_tensors(
+        self, file: str, shapes: dict[str, tuple[int, ...]]
+    ) -> dict[str, Float[Tensor, "frames ..."]] | None:
+        """Tensors of a file that hold one entry for each frame; None without the file.
+
+        Args:
+            file: relative to the folder.
+            shapes: of one frame's entry, by the tensor's name.
+
+        Raises:
+            CaptureError: if they do not fit the frames.
+        """
+        path = self.folder / file
         if not path.is_file():
             return None
         try:
             tensors = load_file(path)
-            found = tensors["covariance"].float()
+            found = {name: tensors[name].float() for name in shapes}
         except (SafetensorError, KeyError, OSError) as error:
-            raise CaptureError(f"{COVARIANCES} cannot be read ({error})", _MAKE_AGAIN) from error
-        if found.shape != (len(self.records), 51, 51) or not bool(torch.isfinite(found).all()):
-            raise CaptureError(
-                f"{COVARIANCES} has shape {tuple(found.shape)} or is not finite, expected "
-                f"({len(self.records)}, 51, 51)",
-                _MAKE_AGAIN,
-            )
+            raise CaptureError(f"{file} cannot be read ({error})", _MAKE_AGAIN) from error
+        for name, shape in shapes.items():
+            values = found[name]
+            if values.shape != (len(self.records), *shape) or not bool(values.isfinite().all()):
+                raise CaptureError(
+                    f"{file}: {name} has shape {tuple(values.shape)} or is not finite, expected "
+                    f"{(len(self.records), *shape)}",
+                    _MAKE_AGAIN,
+                )
         return found
 
     def split(self, name: str) -> tuple[int, ...]:
@@ -578,6 +630,7 @@ class CaptureWriter:
             self._header["shape_coefficients"] = shape_coefficients.double().tolist()
         self._entries: list[dict[str, Any]] = []
         self._covariances: list[Tensor | None] = []
+        self._landmarks: list[LandmarkSightings | None] = []
         self._inputs = tuple(inputs)
         try:
             restore_folder(self.folder)
@@ -629,6 +682,7 @@ class CaptureWriter:
         if not bool((frame.gain == 1).all()):
             said["gain"] = frame.gain.double().tolist()
         self._covariances.append(frame.covariance)
+        self._landmarks.append(frame.landmarks)
         camera = frame.camera
         self._entries.append(
             {
@@ -674,15 +728,16 @@ class CaptureWriter:
             text = json.dumps(content, allow_nan=False)
         except ValueError as error:
             raise CaptureError("a camera or time is not finite", "drop the frame") from error
-        covariances = [matrix for matrix in self._covariances if matrix is not None]
+        covariances = self._of_all_frames(self._covariances, "a covariance")
         if covariances:
-            if len(covariances) != len(self._entries):
-                raise CaptureError(
-                    f"{len(covariances)} of {len(self._entries)} frames say how sure they are",
-                    "give all frames a covariance, or none",
-                )
-            stacked = torch.stack(covariances).detach().cpu().float().contiguous()
-            save_file({"covariance": stacked}, self._aside / COVARIANCES)
+            save_file({"covariance": _stacked(covariances)}, self._aside / COVARIANCES)
+        landmarks = self._of_all_frames(self._landmarks, "landmarks")
+        if landmarks:
+            tensors = {
+                name: _stacked([getattr(seen, name) for seen in landmarks])
+                for name in _LANDMARK_SHAPES
+            }
+            save_file(tensors, self._aside / LANDMARKS)
         with open(self._aside / "transforms.json", "w", encoding="utf-8") as stream:
             stream.write(text)
             stream.flush()
@@ -695,6 +750,21 @@ class CaptureWriter:
             swap_folder(self._aside, self.folder, CAPTURE, self._overwrite, self._inputs)
         except FolderInUse as error:
             raise CaptureError(error.found, error.remedy) from error
+
+
+    def _of_all_frames(self, values: list[Said | None], what: str) -> list[Said]:
+        """What the frames say; either all of them say it or none."""
+        found = [value for value in values if value is not None]
+        if found and len(found) != len(self._entries):
+            raise CaptureError(
+                f"{len(found)} of {len(self._entries)} frames have {what}",
+                f"give all frames {what}, or none",
+            )
+        return found
+
+
+def _stacked(values: list[Tensor]) -> Tensor:
+    return torch.stack(values).detach().cpu().float().contiguous()
 
 
 def write_capture(folder: Path, frames: Iterable[Frame], **header: Any) -> Capture:

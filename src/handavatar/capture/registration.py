@@ -17,7 +17,8 @@ from handavatar.capture.frames import Capture, Frame
 from handavatar.capture.masks import HandMask, mask_coverage
 from handavatar.capture.tracking import TrackedHand
 from handavatar.capture.windows import window_camera
-from handavatar.fit.energy import LandmarkSightings, Observation
+from handavatar.fit.energy import Observation
+from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.fit.pictures import FramePicture
 from handavatar.fit.register import Registered, RegisterOptions, register
 from handavatar.geometry.cameras import Camera
@@ -44,12 +45,34 @@ def window_view(hand: TrackedHand, focal: float) -> Camera:
     return window_camera(focal, window.picture_size, window.corner, side / window.scale, side)
 
 
+def see_landmarks(seen: Observations, fit: HandFit) -> list[LandmarkSightings]:
+    """What the tracker says of every frame, with its expected errors.
+
+    Args:
+        seen: the tracker's landmarks.
+        fit: focal length, and where landmarks lie beside joints.
+    """
+    center = torch.tensor(seen.picture_size) / 2
+    errors = torch.hypot(seen.uncertainty, LANDMARK_ERROR * seen.scale[:, None]) / fit.focal
+    depths = seen.world_landmarks[..., 2]
+    return [
+        LandmarkSightings(
+            (places - center) / fit.focal,
+            error,
+            depth - depth.mean(),
+            torch.full_like(depth, DEPTH_ERROR),
+            fit.offsets,
+        )
+        for places, error, depth in zip(seen.landmarks, errors, depths, strict=True)
+    ]
+
+
 def observe_hands(
     hands: Sequence[TrackedHand],
     masks: Sequence[HandMask],
     known: Sequence[Bool[np.ndarray, "_ _"]],
     gains: Float[np.ndarray, "hands 3"],
-    seen: Observations,
+    landmarks: Sequence[LandmarkSightings],
     focal: float,
 ) -> list[Observation]:
     """What every frame of a video says: landmarks, mask and colours of the hand's surroundings.
@@ -59,7 +82,7 @@ def observe_hands(
         masks: of their windows.
         known: false outside of the picture, behind the wrist, and where the mask is unsure.
         gains: of the channels, frame by frame.
-        seen: the tracker's landmarks.
+        landmarks: of the tracker.
         focal: length, pixels of the whole picture.
     """
     found = []
@@ -75,16 +98,7 @@ def observe_hands(
             _smaller(torch.from_numpy(is_known).float()[..., None], side)[..., 0] > 0.999,
             torch.from_numpy(gains[number]).float(),
         )
-        shrunk = side / view.width
-        expected = torch.hypot(seen.uncertainty[number], LANDMARK_ERROR * seen.scale[number])
-        depths = seen.world_landmarks[number, :, 2]
-        landmarks = LandmarkSightings(
-            torch.from_numpy(window.from_picture(hand.landmarks)).float() * shrunk,
-            expected * window.scale * shrunk,
-            depths - depths.mean(),
-            torch.full_like(depths, DEPTH_ERROR),
-        )
-        found.append(Observation(picture, hand.time, landmarks))
+        found.append(Observation(picture, hand.time, landmarks[number]))
     return found
 
 
@@ -125,7 +139,6 @@ def register_hands(
         torch.diag(sigmas**-2).expand(len(observations), -1, -1),
         options,
         is_sequence=True,
-        start=fit.offsets.flatten(),
         progress=progress,
     )
     return (
@@ -170,9 +183,10 @@ def register_frames(
     learns_shape: bool = True,
     progress: Callable[[float], None] | None = None,
 ) -> Registered:
-    """Lays hands onto frames, held by what the capture says of its poses' errors.
+    """Lays hands onto frames, held by what the capture says of landmarks and its poses' errors.
 
-    Where it says nothing, one error of all joints is learned from how far the poses had to move.
+    Where it does not say how far poses are off, one error of all joints is learned from how far
+    they had to move.
 
     Args:
         hands: rest hand to begin with, one for all frames or one for each.
@@ -211,4 +225,4 @@ def observe_frame(frame: Frame) -> Observation:
     picture = FramePicture.of(
         frame.camera, frame.image.float() / 255, frame.alpha, frame.known, frame.gain
     )
-    return Observation(picture, frame.time)
+    return Observation(picture, frame.time, frame.landmarks)

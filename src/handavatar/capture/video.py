@@ -52,6 +52,7 @@ from handavatar.capture.registration import (
     observe_hands,
     posed_vertices,
     register_hands,
+    see_landmarks,
     window_view,
 )
 from handavatar.capture.seen_skin import SeenSkin, count_seen_skin
@@ -66,6 +67,7 @@ from handavatar.capture.tracking import (
 )
 from handavatar.capture.windows import Window, resampled, window_camera
 from handavatar.fit.energy import VIDEO_TEXTURE_SHARE, EnergyOptions
+from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.cameras import project
 from handavatar.hand.rig import Rig
@@ -144,14 +146,16 @@ class FittedHands:
         fit: shape, poses, focal length.
         vertices: of the rig in every frame, metres, camera axes.
         landmark_errors: mean distance of fitted and tracked landmarks, metres.
-        covariances: of the poses' errors as far as landmarks and motion tell them; zeros where
-            nothing was asked.
+        covariances: of the poses' errors as far as motion tells them; zeros where nothing was
+            asked.
+        landmarks: of the tracker, with their offsets from joints as found.
     """
 
     fit: HandFit
     vertices: Float[Tensor, "frames vertices 3"]
     landmark_errors: Float[Tensor, "frames"]
     covariances: Float[Tensor, "frames 51 51"]
+    landmarks: list[LandmarkSightings]
 
 
 @dataclass(frozen=True)
@@ -431,7 +435,9 @@ def _registered(
 ) -> FittedHands:
     """The hand laid onto landmarks, masks and texture: the one place that knows how."""
     seen = observations_of(track)
-    observations = observe_hands(track.hands, masks, known, gains, seen, before.fit.focal)
+    observations = observe_hands(
+        track.hands, masks, known, gains, before.landmarks, before.fit.focal
+    )
     fit, found = register_hands(rig, before.fit, observations, options, report)
     covariances = torch.linalg.inv(found.information.double()).float()
     return _judged_fit(rig, seen, fit, posed_vertices(found), covariances)
@@ -445,7 +451,7 @@ def _judged_fit(
     covariances: Float[Tensor, "frames 51 51"],
 ) -> FittedHands:
     errors = landmark_errors(HandModel(rig), observations, fit) / observations.scale
-    return FittedHands(fit, vertices, errors, covariances)
+    return FittedHands(fit, vertices, errors, covariances, see_landmarks(observations, fit))
 
 
 def _known_before_wrist(
@@ -523,6 +529,7 @@ def _result(
         known=torch.from_numpy(known),
         gain=torch.from_numpy(gain).float(),
         covariance=fitted.covariances[number],
+        landmarks=fitted.landmarks[number],
     )
     pixels = float(np.ptp(hand.landmarks, axis=0).max())
     reason = _reason(pixels, outside, unknown, guided, factors, iou, error, options.min_confidence)

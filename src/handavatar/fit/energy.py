@@ -23,6 +23,7 @@ from handavatar.fit.kinematics import (
     pixel_jacobian,
     rest_with_pose,
 )
+from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.fit.pictures import FramePicture, PictureBand, drawing_camera
 from handavatar.fit.shape import ShapeSpace
 from handavatar.geometry.cameras import Camera
@@ -60,23 +61,6 @@ class EnergyOptions:
     landmark_outlier: float = 8.0
     """Standard deviations beyond which a landmark is misplaced: where a finger lies on the palm
     the outline says nothing, and would be let to have its way."""
-
-
-@dataclass(frozen=True, eq=False)
-class LandmarkSightings:
-    """A tracker's landmarks in one frame.
-
-    Attributes:
-        pixels: of this picture.
-        errors: expected, pixels, each way.
-        depths: metres along the line of sight, relative to their mean.
-        depth_errors: expected, metres.
-    """
-
-    pixels: Float[Tensor, "21 2"]
-    errors: Float[Tensor, "21"]
-    depths: Float[Tensor, "21"]
-    depth_errors: Float[Tensor, "21"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,8 +326,10 @@ def _add_landmarks(
     positions = skeleton.positions(rest)
     pixels, depths, moving = pixel_jacobian(camera, positions)
     jacobian = skeleton.jacobian(rest)
-    in_picture = (moving @ jacobian) / landmarks.errors[:, None, None]
-    apart = (pixels - landmarks.pixels) / landmarks.errors[:, None]
+    focal, center = pixels.new_tensor(camera.focal), pixels.new_tensor(camera.center)
+    errors = landmarks.errors[:, None] * focal
+    in_picture = (moving @ jacobian) / errors[..., None]
+    apart = (pixels - landmarks.directions * focal - center) / errors
     distance = apart.norm(dim=-1, keepdim=True).expand(-1, 2)
     ones = torch.ones(2 * len(apart))
     total.add(

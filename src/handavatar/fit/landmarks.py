@@ -4,6 +4,8 @@ Trackers are taught by people who click on knuckles; a rig's joints lie inside. 
 the same in every frame, in the axes of the bone, and is learned over the clip.
 """
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -18,6 +20,26 @@ NUM_OFFSETS = 63
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
 _TOLERANCES = {"wrist": 0.010, "cmc": 0.008, "mcp": 0.006, "tip": 0.004}
 _TOLERANCE = 0.003
+
+
+@dataclass(frozen=True, eq=False)
+class LandmarkSightings:
+    """A tracker's landmarks in one frame, as any picture of its camera has them.
+
+    Attributes:
+        directions: x and y over z, in the camera's axes (OpenCV).
+        errors: expected, of x and of y alike.
+        depths: along the line of sight, metres, relative to their mean.
+        depth_errors: expected, metres.
+        offsets: from the rig's joints and fingertips to the landmarks, metres in the rest axes of
+            their bone, as far as they are known.
+    """
+
+    directions: Float[Tensor, "21 2"]
+    errors: Float[Tensor, "21"]
+    depths: Float[Tensor, "21"]
+    depth_errors: Float[Tensor, "21"]
+    offsets: Float[Tensor, "21 3"]
 
 
 def landmark_rest(hand: ShapedHand, space: ShapeSpace, offsets: Float[Tensor, "63"]) -> RestPoints:

@@ -94,7 +94,7 @@ class Registered:
         hand: rest hand of the first frame with its shape as found.
         shape_change: of the rig's coefficients.
         offsets: of the tracker's landmarks, metres; none without landmarks.
-        information: what landmarks, motion and the tracked poses say of each pose, without masks
+        information: what motion and the tracked poses say of each pose, without landmarks, masks
             and colours: an inverse covariance.
         energies: how badly each frame is explained; a good one has about as many as the best.
         pose_error: degrees by which the tracked poses were off, as learned.
@@ -121,7 +121,6 @@ def register(
     options: RegisterOptions,
     is_sequence: bool = False,
     learns_shape: bool = True,
-    start: Float[Tensor, "63"] | None = None,
     progress: Progress | None = None,
 ) -> Registered:
     """Lays one hand onto all frames.
@@ -136,7 +135,6 @@ def register(
         options: expected errors, rounds.
         is_sequence: whether the frames are neighbours in time.
         learns_shape: whether the hand's shape moves.
-        start: offsets of the landmarks to begin with, where there are landmarks; zeros if None.
         progress: told how far it is.
     """
     threads = torch.get_num_threads()
@@ -149,7 +147,6 @@ def register(
             options,
             is_sequence,
             learns_shape,
-            start,
             progress or (lambda share: None),
             threads,
         )
@@ -163,7 +160,6 @@ def _register(
     options: RegisterOptions,
     is_sequence: bool,
     learns_shape: bool,
-    start: Float[Tensor, "63"] | None,
     report: Progress,
     threads: int,
 ) -> Registered:
@@ -172,7 +168,8 @@ def _register(
     space = ShapeSpace.around(rig, options.coefficient_sigma) if learns_shape else fixed_shape(rig)
     generator = torch.Generator().manual_seed(options.seed)
     surface, balls = _compared_points(rig), fill_with_balls(rig)
-    has_landmarks = any(seen.landmarks is not None for seen in observations)
+    known_offsets = [seen.landmarks.offsets for seen in observations if seen.landmarks is not None]
+    has_landmarks = len(known_offsets) > 0
     num_shapes = len(space.sigmas)
 
     def points_of(shared: Float[Tensor, "shared"], frame: int) -> HandPoints:
@@ -186,8 +183,8 @@ def _register(
     space_sigmas = space.sigmas / max(1.0, _SHARED_ERRORS * len(observations)) ** 0.5
     sigmas = torch.cat([space_sigmas, offset_tolerances()]) if has_landmarks else space_sigmas
     shared = torch.zeros(len(sigmas))
-    if start is not None:
-        shared[num_shapes:] = start
+    if has_landmarks:
+        shared[num_shapes:] = torch.stack(known_offsets).mean(0).flatten()
 
     error = options.pose_error
     is_learned = information is None and options.learns_pose_error

@@ -4,7 +4,6 @@ Each frame has its own damping, and keeps its pose where a step does not lower i
 of the shape moves all poses with it (Schur complement), and is taken back as a whole.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -48,10 +47,6 @@ class Look:
     outlier: float
     texture: SkinTexture | None = None
     texture_error: float = 1.0
-
-
-_BLIND = Look(0.7, 1.0)
-"""For landmarks, which look at no picture."""
 
 
 @dataclass(eq=False)
@@ -147,15 +142,11 @@ class Descent:
         return here.energies, torch.linalg.inv(here.pose_blocks().double()).float()
 
     def tracked_information(self) -> Float[Tensor, "frames 51 51"]:
-        """What landmarks, motion and the tracked poses say of each pose; neither masks nor colours.
+        """What motion and the tracked poses say of each pose: no landmarks, masks or colours.
 
-        Whoever goes on from the poses found, with masks and colours of their own, holds them by
-        this.
+        Whoever goes on from the poses found, with these observations at hand, holds them by this.
         """
-        blind = replace(self.options, outline_points=0.0, contact_error=math.inf)
-        parts = self._linearised_frames(_BLIND, self.poses, self.shared, blind)
-        own = slice(NUM_UNKNOWNS)
-        found = torch.stack([part.hessian[own, own] for part in parts]) + self.information
+        found = self.information
         times = self.times if self.is_sequence else self.times[:0]
         return found + torch.diag_embed(motion_terms(self.poses, times).curvature(len(found)))
 
@@ -203,7 +194,7 @@ class Descent:
         self.damping = (self.damping * factor).clamp(_LEAST_DAMPING, _MOST_DAMPING)
 
     def _linearised_frames(
-        self, look: Look, poses: HandPose, shared: Float[Tensor, "shared"], options: EnergyOptions
+        self, look: Look, poses: HandPose, shared: Float[Tensor, "shared"]
     ) -> list[Linearised]:
         """What each frame's own observations say."""
 
@@ -217,13 +208,13 @@ class Descent:
                 look.texture_error,
                 look.sigma,
                 look.outlier,
-                options,
+                self.options,
             )
 
         return mapped(linearised, range(len(self.observations)), self.threads)
 
     def _linearised(self, look: Look, poses: HandPose, shared: Float[Tensor, "shared"]) -> "_Whole":
-        parts = self._linearised_frames(look, poses, shared, self.options)
+        parts = self._linearised_frames(look, poses, shared)
         hessian = torch.stack([part.hessian for part in parts])
         gradient = torch.stack([part.gradient for part in parts])
         energies = torch.tensor([part.energy for part in parts])
