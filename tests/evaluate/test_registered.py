@@ -10,6 +10,7 @@ from torch import Tensor
 from handavatar.avatar import HandAvatar, Rendering
 from handavatar.capture.frames import Frame
 from handavatar.evaluate.registered import registered_pose
+from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
@@ -110,6 +111,19 @@ def test_turning_the_world_changes_nothing(avatar: HandAvatar) -> None:
     assert distance(avatar, start, found) > 1e-3
     # With errors along the world's axes, 0.27 mm.
     assert float(apart.mean()) < 1.8e-4
+
+
+def test_landmarks_of_the_frame_are_not_asked(avatar: HandAvatar) -> None:
+    true = bent_pose(2)
+    frame, start = photograph(avatar, true), misread(true)
+    rendering = drawn(avatar, start, frame.camera)
+    places, sure = torch.zeros(21, 2), torch.full((21,), 1e-3)
+    landmarks = LandmarkSightings(places, sure, torch.zeros(21), sure, torch.zeros(21, 3))
+    found = [
+        registered_pose(avatar, picture, start, rendering)
+        for picture in (frame, replace(frame, landmarks=landmarks))
+    ]
+    assert torch.equal(found[0].rotations, found[1].rotations)
 
 
 def test_gain_is_not_taken_for_a_pose_error(avatar: HandAvatar) -> None:

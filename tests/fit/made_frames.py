@@ -9,10 +9,11 @@ from torch import Tensor
 
 from handavatar.fit.contact import fill_with_balls
 from handavatar.fit.energy import HandPoints, Observation
-from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, moved_pose
+from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, Skeleton, moved_pose
+from handavatar.fit.landmarks import LandmarkSightings, landmark_rest
 from handavatar.fit.pictures import FramePicture
 from handavatar.fit.shape import ShapeSpace, fixed_shape
-from handavatar.geometry.cameras import Camera, look_at
+from handavatar.geometry.cameras import Camera, look_at, project
 from handavatar.geometry.meshes import sample_surface_evenly, vertex_normals
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import sample_poses
@@ -79,6 +80,27 @@ def observed(
         known = torch.ones_like(coverage, dtype=torch.bool)
     picture = FramePicture.of(camera, color, coverage, known, torch.ones(3))
     return Observation(picture, time)
+
+
+def sightings(
+    hand: ShapedHand, pose: HandPose, camera: Camera, pixels_off: float = 3.0
+) -> LandmarkSightings:
+    """What an exact tracker sees, moved by some pixels and two centimetres in depth."""
+    space = fixed_shape(hand.rig)
+    rest = landmark_rest(hand, space, torch.zeros(63))
+    skeleton = Skeleton.of(hand, pose, space.joint_directions).padded(63)
+    pixels, depths = project(camera, skeleton.positions(rest))
+    generator = torch.Generator().manual_seed(5)
+    pixels = pixels + pixels_off * torch.randn(21, 2, generator=generator)
+    depths = depths + 0.02 * torch.randn(21, generator=generator)
+    focal, center = torch.tensor(camera.focal), torch.tensor(camera.center)
+    return LandmarkSightings(
+        (pixels - center) / focal,
+        (1 + 2 * torch.rand(21, generator=generator)) / focal[0],
+        depths - depths.mean(),
+        torch.full((21,), 0.02),
+        torch.zeros(21, 3),
+    )
 
 
 def observe_all(hand: ShapedHand, poses: HandPose, camera: Camera) -> list[Observation]:

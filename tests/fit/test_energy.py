@@ -12,6 +12,7 @@ from made_frames import (
     points_on,
     pose_at,
     scribble,
+    sightings,
     spoilt,
 )
 
@@ -23,11 +24,10 @@ from handavatar.fit.energy import (
     Observation,
     linearise_frame,
 )
-from handavatar.fit.kinematics import NUM_UNKNOWNS, Skeleton, moved_pose
-from handavatar.fit.landmarks import LandmarkSightings, landmark_rest
+from handavatar.fit.kinematics import NUM_UNKNOWNS, moved_pose
+from handavatar.fit.landmarks import landmark_rest
 from handavatar.fit.pictures import FramePicture
 from handavatar.fit.shape import ShapeSpace
-from handavatar.geometry.cameras import Camera, project
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import Rig
 
@@ -83,28 +83,6 @@ def _slopes(
     return torch.tensor(found)
 
 
-def _sightings(
-    points: HandPoints, pose: HandPose, camera: Camera, seed: int = 5
-) -> LandmarkSightings:
-    """What an exact tracker sees, moved by three pixels and two centimetres."""
-    skeleton = Skeleton.of(points.hand, pose, points.space.joint_directions).padded(
-        points.landmarks.directions.shape[-1]
-    )
-    pixels, depths = project(camera, skeleton.positions(points.landmarks))
-    generator = torch.Generator().manual_seed(seed)
-    pixels = pixels + 3 * torch.randn(21, 2, generator=generator)
-    depths = depths + 0.02 * torch.randn(21, generator=generator)
-    errors = 1 + 2 * torch.rand(21, generator=generator)
-    focal, center = torch.tensor(camera.focal), torch.tensor(camera.center)
-    return LandmarkSightings(
-        (pixels - center) / focal,
-        errors / focal[0],
-        depths - depths.mean(),
-        torch.full((21,), 0.02),
-        torch.zeros(21, 3),
-    )
-
-
 def _with_landmarks(points: HandPoints) -> HandPoints:
     return replace(points, landmarks=landmark_rest(points.hand, points.space, torch.zeros(63)))
 
@@ -130,7 +108,7 @@ def test_the_slope_of_landmarks_is_exact(rig: Rig) -> None:
         torch.zeros(SIZE, SIZE, dtype=torch.bool),
         torch.ones(3),
     )
-    seen = Observation(blank, 0.0, _sightings(points, pose, camera))
+    seen = Observation(blank, 0.0, sightings(points.hand, pose, camera))
     options = replace(SQUARES, outline_points=0.0)
     found = _linearised(points, pose, seen, options)
     assert found.gradient.shape == (NUM_UNKNOWNS + 12 + 63,)

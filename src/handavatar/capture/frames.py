@@ -751,7 +751,6 @@ class CaptureWriter:
         except FolderInUse as error:
             raise CaptureError(error.found, error.remedy) from error
 
-
     def _of_all_frames(self, values: list[Said | None], what: str) -> list[Said]:
         """What the frames say; either all of them say it or none."""
         found = [value for value in values if value is not None]

@@ -259,6 +259,8 @@ def follow_picture(
 ) -> HandPose:
     """One pose, drawn to a picture's outline and texture, when it is known how the hand looks.
 
+    The picture's landmarks are not looked at.
+
     Args:
         hand: rest hand; its shape stays.
         seen: the picture to follow.
@@ -275,7 +277,8 @@ def follow_picture(
     start = HandPose(pose.rotations[None], pose.translation[None])
     with one_thread():
         descent = Descent(
-            observations=[seen],
+            # What a tracker said has its say in the information.
+            observations=[replace(seen, landmarks=None)],
             times=torch.zeros(1),
             tracked=start,
             information=information[None],
