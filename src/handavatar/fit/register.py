@@ -39,6 +39,9 @@ _TILTED_EVERY = 3
 _THOROUGH_STEPS = 4
 _TRIED_STEPS = 2
 """Of each width, from a pose that is tried."""
+_LANDMARK_STEPS = 10
+_OUTLINE_BESIDE_LANDMARKS = 2.5
+"""Independent points of an outline, each way, where landmarks are to lead."""
 _FOLLOWED_STEPS = 4
 """At each size of details, of a picture that is followed."""
 _NO_LANDMARKS = RestPoints(torch.zeros(0, 3), torch.zeros(0, 16), torch.zeros(0, 3, 0))
@@ -215,6 +218,8 @@ def _register(
     report(0.35)
     for turn in range(options.restarts):
         begin_anew(descent, Look(_FINE, _NARROW), generator, is_near=turn % 2 == 1)
+    if has_landmarks:
+        begin_at_landmarks(descent, Look(_FINE, _NARROW))
     report(0.45)
     descent.step_shape(Look(_FINE, _NARROW), 4)
     if is_learned:
@@ -346,6 +351,25 @@ def begin_anew(descent: Descent, look: Look, generator: torch.Generator, is_near
     change = torch.randn(len(bad), NUM_UNKNOWNS, generator=generator) * spread.minimum(_FARTHEST)
     start = HandPose(around.rotations[bad], around.translation[bad])
     _try(descent, look, bad, moved_pose(start, change), _THOROUGH_STEPS)
+
+
+def begin_at_landmarks(descent: Descent, look: Look) -> None:
+    """Tries every frame from where its landmarks have the hand, however far that is.
+
+    Where fingers lie on the palm the outline has many poses that are about as good, and a finger
+    in one of them does not find its way to another.
+
+    Args:
+        descent: of all frames.
+        look: by which frames are judged.
+    """
+    frames = torch.arange(len(descent.observations))
+    part = descent.select(frames)
+    part.options = replace(
+        descent.options, outline_points=_OUTLINE_BESIDE_LANDMARKS, landmark_outlier=math.inf
+    )
+    part.step_poses(replace(look, outlier=_WIDE), _LANDMARK_STEPS)
+    _try(descent, look, frames, part.poses, _TRIED_STEPS)
 
 
 def begin_tilted(descent: Descent, look: Look, degrees: float) -> None:
