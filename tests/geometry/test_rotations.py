@@ -113,6 +113,9 @@ def test_nearest_rotations_mean_the_same_and_lie_nearer() -> None:
     torch.testing.assert_close(matrix_from_axis_angle(found), matrix_from_axis_angle(given))
     assert bool(((found - reference).norm(dim=-1) <= (given - reference).norm(dim=-1)).all())
     assert bool((found != given).any()) and bool((found == given).all(-1).any())
+    # A turn too small to see has its other vector a whole turn away, whatever the reference.
+    tiny = torch.tensor([[1e-12, 0.0, 0.0]], dtype=torch.float64)
+    assert torch.equal(nearest_rotations(tiny, torch.tensor([[-1.0, 0, 0]]).double()), tiny)
     # Nearest to none at all: at most half a turn.
     turned = torch.tensor([[0.0, 4.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
     expected = torch.tensor([[0.0, 4.0 - 2 * math.pi, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 0.0]])

@@ -90,8 +90,8 @@ def nearest_rotations(
     rotations: Float[Tensor, "*n 3"], reference: Float[Tensor, "*#n 3"]
 ) -> Float[Tensor, "*n 3"]:
     """The same rotations as the axis-angle vectors nearest to others: a half turn has two."""
-    angle = rotations.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-    other = rotations * (1 - 2 * math.pi / angle)
+    angle = rotations.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(rotations.dtype).tiny)
+    other = rotations - 2 * math.pi * (rotations / angle)
     is_nearer = (other - reference).norm(dim=-1) < (rotations - reference).norm(dim=-1)
     return torch.where(is_nearer[..., None], other, rotations)
 
