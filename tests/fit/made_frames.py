@@ -103,6 +103,11 @@ def sightings(
     )
 
 
+def with_landmarks(points: HandPoints) -> HandPoints:
+    """The same hand, with what a tracker's landmarks are on it."""
+    return replace(points, landmarks=landmark_rest(points.hand, points.space, torch.zeros(63)))
+
+
 def observe_all(hand: ShapedHand, poses: HandPose, camera: Camera) -> list[Observation]:
     """All poses, a tenth of a second apart."""
     return [

@@ -14,6 +14,7 @@ from made_frames import (
     scribble,
     sightings,
     spoilt,
+    with_landmarks,
 )
 
 from handavatar.fit.appearance import SkinTexture, fit_texture, see_texture
@@ -83,10 +84,6 @@ def _slopes(
     return torch.tensor(found)
 
 
-def _with_landmarks(points: HandPoints) -> HandPoints:
-    return replace(points, landmarks=landmark_rest(points.hand, points.space, torch.zeros(63)))
-
-
 def _close(gradient: torch.Tensor, slope: torch.Tensor) -> tuple[float, float]:
     """Cosine between a doubled gradient and a slope, and ratio of their lengths."""
     doubled = 2 * gradient
@@ -99,7 +96,7 @@ SEEN_WELL = [0, 1, 2, 3, 5, 12, 14, 15, 21, 24, 30, 33, 39, 40, 41, 48, 49, 50]
 
 def test_the_slope_of_landmarks_is_exact(rig: Rig) -> None:
     camera = camera_over(SIZE)
-    points = _with_landmarks(points_on(rig.shaped(), ShapeSpace.around(rig, 0.5, 2), 20))
+    points = with_landmarks(points_on(rig.shaped(), ShapeSpace.around(rig, 0.5, 2), 20))
     pose = pose_at(calm_poses(rig, 1), 0)
     blank = FramePicture.of(
         camera,

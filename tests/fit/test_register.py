@@ -10,27 +10,25 @@ from made_frames import (
     draw,
     moved_by,
     observe_all,
+    points_on,
     pose_at,
     scribble,
     sightings,
     spoilt,
+    with_landmarks,
 )
 
-from handavatar.fit.contact import fill_with_balls
-from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
-from handavatar.fit.landmarks import landmark_rest
+from handavatar.fit.energy import EnergyOptions, Observation
 from handavatar.fit.pictures import FramePicture
 from handavatar.fit.register import (
     Registered,
     RegisterOptions,
-    _compared_points,
     begin_at_landmarks,
     register,
 )
-from handavatar.fit.shape import fixed_shape
 from handavatar.fit.solver import Descent, Look
 from handavatar.hand.pose import HandPose
-from handavatar.hand.rig import Rig
+from handavatar.hand.rig import Rig, ShapedHand
 
 QUICK = RegisterOptions(restarts=0, texture_sigmas=(3.0,), texture_rounds=1)
 """One pass of every stage."""
@@ -142,46 +140,46 @@ def test_a_sequence_follows_its_times(rig: Rig, short: Clip) -> None:
     assert torch.equal(single.hand.rest_vertices, rig.shaped().rest_vertices)
 
 
+LOOSE = torch.diag(torch.tensor([0.9] * 48 + [0.05] * 3) ** -2)
+"""Of poses of which nobody says how far they are off, as a capture hands them to training."""
+
+
+def _with_sightings(hand: ShapedHand, clip: Clip, pixels_off: float) -> list[Observation]:
+    return [
+        replace(
+            seen,
+            landmarks=sightings(
+                hand, pose_at(clip.truth, frame), seen.picture.camera, pixels_off=pixels_off
+            ),
+        )
+        for frame, seen in enumerate(clip.observations)
+    ]
+
+
 def test_landmarks_lead_back_what_outlines_alone_do_not(rig: Rig, short: Clip) -> None:
-    """Poses of which nobody says how far they are off, as a capture hands them to training."""
-    tracked = spoilt(short.truth, 20.0)
-    camera = short.observations[0].picture.camera
-    loose = torch.diag(torch.tensor([0.9] * 48 + [0.05] * 3) ** -2).expand(3, -1, -1)
+    hand, tracked = rig.shaped(), spoilt(short.truth, 20.0)
+    loose = LOOSE.expand(3, -1, -1)
     errors = []
-    for has_landmarks in (False, True):
-        observations = [
-            replace(seen, landmarks=sightings(rig.shaped(), pose_at(short.truth, frame), camera, 1))
-            if has_landmarks
-            else seen
-            for frame, seen in enumerate(short.observations)
-        ]
-        found = register([rig.shaped()], observations, tracked, loose, QUICK, learns_shape=False)
-        errors.append(float(moved_by(rig.shaped(), found.poses, short.truth).mean()))
-        assert len(found.offsets) == (63 if has_landmarks else 0)
+    for observations, count in ((short.observations, 0), (_with_sightings(hand, short, 1.0), 63)):
+        found = register([hand], observations, tracked, loose, QUICK, learns_shape=False)
+        errors.append(float(moved_by(hand, found.poses, short.truth).mean()))
+        assert len(found.offsets) == count
     # Measured: 10.9 and 16.9 mm, with landmarks as unsure as 1 to 3 pixels of 64.
     assert errors[1] < 0.75 * errors[0]
 
 
 def test_a_finger_on_the_wrong_side_finds_back_by_its_landmarks(rig: Rig, short: Clip) -> None:
-    hand, camera = rig.shaped(), short.observations[0].picture.camera
-    observations = [
-        replace(seen, landmarks=sightings(hand, pose_at(short.truth, frame), camera, 0.3))
-        for frame, seen in enumerate(short.observations)
-    ]
+    hand = rig.shaped()
     rotations = short.truth.rotations.clone()
     # The index finger's first two joints, bent far towards the palm.
     rotations[:, 1:3, 2] += 1.8
     bent = HandPose(rotations, short.truth.translation)
-    loose = torch.diag(torch.tensor([0.9] * 48 + [0.05] * 3) ** -2).expand(3, -1, -1)
-    surface, space = _compared_points(rig), fixed_shape(rig)
-    points = HandPoints(
-        hand, space, surface, fill_with_balls(rig), landmark_rest(hand, space, torch.zeros(63))
-    )
+    points = with_landmarks(points_on(hand))
     descent = Descent(
-        observations=observations,
+        observations=_with_sightings(hand, short, 0.3),
         times=torch.zeros(3),
         tracked=bent,
-        information=loose,
+        information=LOOSE.expand(3, -1, -1),
         points_of=lambda shared, frame: points,
         shared_sigmas=torch.zeros(0),
         options=EnergyOptions(),

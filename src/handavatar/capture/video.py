@@ -240,8 +240,8 @@ def capture_video(
 ) -> Capture:
     """Makes a capture of a video of one hand.
 
-    Poses come from landmarks and masks alone, in held-out frames as in all others. World axes are
-    those of the camera, which is taken as standing still.
+    Poses come from landmarks, masks and texture, in held-out frames as in all others. World axes
+    are those of the camera, which is taken as standing still.
 
     Args:
         options: which video, where to, how.

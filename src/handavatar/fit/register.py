@@ -282,7 +282,7 @@ def follow_picture(
     start = HandPose(pose.rotations[None], pose.translation[None])
     with one_thread():
         descent = Descent(
-            # What a tracker said has its say in the information.
+            # The pose to begin with has been laid onto them already.
             observations=[replace(seen, landmarks=None)],
             times=torch.zeros(1),
             tracked=start,

@@ -146,9 +146,9 @@ class Descent:
 
         Whoever goes on from the poses found, with these observations at hand, holds them by this.
         """
-        found = self.information
         times = self.times if self.is_sequence else self.times[:0]
-        return found + torch.diag_embed(motion_terms(self.poses, times).curvature(len(found)))
+        curvature = motion_terms(self.poses, times).curvature(len(self.information))
+        return self.information + torch.diag_embed(curvature)
 
     def step_poses(self, look: Look, steps: int) -> None:
         """Descends in the poses; every frame keeps what is best for it."""
