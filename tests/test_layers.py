@@ -33,7 +33,8 @@ MAY_IMPORT = {
         "plain": "geometry field render avatar",
         # Registers poses, fits the textured mesh that it compares with, and films what it judged.
         "evaluate": (
-            "geometry jobs hand fit capture field render edit avatar alignment plain animate"
+            "geometry jobs hand fit capture field render edit avatar alignment plain animate "
+            "retouch"
         ),
         "train": (
             "geometry jobs hand fit capture field render avatar plain alignment evaluate processes"

@@ -238,9 +238,12 @@ class HandAvatar(nn.Module):
         edit: changes of the look that belong to the avatar: they are saved with it, and what
             rendering is asked for comes on top.
         texture: detail that is finer than the anchors; None where none was learned.
+        seen_frames: training frames that saw each anchor from the front, unhidden; what none has
+            seen is a guess. None where nobody counted.
     """
 
     texture: DetailTexture | None
+    seen_frames: Tensor | None
     coefficients: Tensor
     anchor_corners: Tensor
     anchor_barycentric: Tensor
@@ -279,6 +282,7 @@ class HandAvatar(nn.Module):
         self.register_buffer("coefficients", coefficients.clone())
         self.register_buffer("anchor_corners", anchors.faces)
         self.register_buffer("anchor_barycentric", anchors.barycentric)
+        self.register_buffer("seen_frames", None)
         self.shape = ShapeOffsets()
         self.occupancy = PairOccupancy()
         self.albedo = AlbedoField(len(anchors.faces))
@@ -894,6 +898,8 @@ class HandAvatar(nn.Module):
             self.texture = None
         elif self.texture is None or self.texture.texels.shape != texels.shape:
             self.give_texture(len(texels))
+        seen_frames = state.get("seen_frames")
+        self.seen_frames = None if seen_frames is None else torch.zeros_like(seen_frames)
         self.load_state_dict(state)
         self.edit = _stored_edit(about["edit"], tensors)
 

@@ -14,6 +14,9 @@ from handavatar.capture.checks import CaptureError, decoded, open_picture
 from handavatar.edit import Edit, Paint, bones_named
 from handavatar.hand.rig import Rig
 
+_UNSEEN_COLOR = (0.85, 0.1, 0.75)
+_UNSEEN_OPACITY = 0.7
+
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
@@ -131,6 +134,19 @@ def paint_of(picture: Image.Image, name: str, avatar: HandAvatar) -> Paint:
     column, row = (places * size).long().clamp_min(0).minimum(size.long() - 1).unbind(-1)
     chosen = pixels[row.cpu(), column.cpu()].to(places) / 255
     return Paint(chosen[:, :3], chosen[:, 3])
+
+
+def tint_unseen(avatar: HandAvatar) -> Edit:
+    """Paint on the skin that no training frame has seen; its look there is a guess.
+
+    Raises:
+        ValueError: if the avatar does not know what was seen.
+    """
+    if avatar.seen_frames is None:
+        raise ValueError("this avatar does not know what was seen: train it with this version")
+    unseen = (avatar.seen_frames == 0).to(avatar.anchor_barycentric)
+    colors = unseen.new_tensor(_UNSEEN_COLOR).expand(len(unseen), 3)
+    return Edit(paint=Paint(colors, _UNSEEN_OPACITY * unseen))
 
 
 def anchor_places(

@@ -44,10 +44,11 @@ KEYS = {
     "mask_iou",
     "baseline",
     "truth",
+    "skin_never_seen",
     "perceptual",
     "notes",
 }
-"""Of the product page."""
+"""Of the product page, and what was never seen."""
 
 OF_A_PROTOCOL = {"masked", "core", "border", "detail", "mask_iou", "flip", "intervals"}
 

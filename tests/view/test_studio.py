@@ -115,6 +115,36 @@ def test_the_avatars_own_edit_is_where_pages_begin_and_can_be_taken_back(
     assert torch.equal(found.color, wanted.color)
 
 
+def test_skin_that_nobody_saw_is_tinted_in_a_layer_of_its_own(
+    studio: Studio, small_avatar: HandAvatar
+) -> None:
+    assert "unseen" not in studio.about()["layers"]
+    with pytest.raises(SceneError, match="does not know what was seen"):
+        studio.fluid(Scene(size=SIZE, layer="unseen"))
+    avatar = copy.deepcopy(small_avatar)
+    avatar.seen_frames = torch.ones(256, dtype=torch.int32)
+    every = Studio(avatar, settings=FEW)
+    assert every.about()["layers"] == [*LAYERS, "unseen"]
+    scene = Scene(size=SIZE)
+    for stage in ("fluid", "half"):
+
+        def shown(of: Studio, layer: str, stage: str = stage) -> np.ndarray:
+            asked = replace(scene, layer=layer)
+            return of.fluid(asked) if stage == "fluid" else of.refined(asked, stage, never)
+
+        assert np.array_equal(shown(every, "unseen"), shown(every, "rgb"))
+        avatar.seen_frames = torch.zeros(256, dtype=torch.int32)
+        nothing = Studio(avatar, settings=FEW)
+        plain, tinted = shown(nothing, "rgb").astype(int), shown(nothing, "unseen").astype(int)
+        covered = plain.sum(-1) > 60
+        # Violet wins over green, under the same light.
+        gain = (tinted - plain)[covered].mean(0)
+        assert gain[2] > gain[1] + 10 and gain[0] > gain[1] + 10
+        avatar.seen_frames = torch.ones(256, dtype=torch.int32)
+    # What is saved has no tint.
+    assert nothing.edit(Touches()).paint is None
+
+
 def test_a_stale_picture_ends_early(studio: Studio) -> None:
     asked = 0
 

@@ -53,33 +53,54 @@ def count_seen_skin(
     hand = rig.shaped(coefficients)
     counts = torch.zeros(rig.num_vertices, dtype=torch.long)
     for frame in frames:
-        counts += _sees(rig, hand.posed(frame.pose).vertices, frame)
+        counts += seen_vertices(hand.posed(frame.pose).vertices, rig.faces, frame)
     area = torch.zeros(rig.num_vertices)
     per_corner = face_cross_products(hand.rest_vertices, rig.faces).norm(dim=-1) / 6
     area.index_add_(0, rig.faces.flatten(), per_corner.repeat_interleave(3))
     unseen = area * (counts == 0)
-    regions = {}
-    for name, vertices in skin_regions(rig).items():
-        share = float(unseen[vertices].sum() / area[vertices].sum().clamp_min(1e-12))
-        if share > _NAMED:
-            regions[name] = round(share, 3)
-    return SeenSkin(counts, float(unseen.sum() / area.sum()), regions)
+    return SeenSkin(counts, float(unseen.sum() / area.sum()), unseen_regions(rig, area, unseen))
 
 
-def _sees(
-    rig: Rig, vertices: Float[Tensor, "vertices 3"], frame: Frame
+def unseen_regions(
+    rig: Rig, area: Float[Tensor, "vertices"], unseen: Float[Tensor, "vertices"]
+) -> dict[str, float]:
+    """Names of the regions of which most was never seen, and how much of each, in [0, 1].
+
+    Args:
+        rig: its vertices have regions.
+        area: of the skin that belongs to each vertex, in any unit.
+        unseen: of it, what nobody has seen.
+    """
+    shares = {
+        name: float(unseen[vertices].sum() / area[vertices].sum().clamp_min(1e-12))
+        for name, vertices in skin_regions(rig).items()
+    }
+    return {name: round(share, 3) for name, share in shares.items() if share > _NAMED}
+
+
+@torch.no_grad()
+def seen_vertices(
+    vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"], frame: Frame
 ) -> Bool[Tensor, "vertices"]:
-    camera = frame.camera
+    """Which vertices of a mesh face the camera, unhidden, in a known pixel.
+
+    Args:
+        vertices: of the posed hand, metres, world.
+        faces: of its mesh.
+        frame: camera and known pixels; its pose plays no part.
+    """
+    camera = frame.camera.to(vertices.device)
     pixels, depths = project(camera, vertices)
     rotation, shift = camera.camera_from_world.split([3, 1], dim=-1)
     eye = -(rotation[:3].T @ shift[:3, 0])
     towards = torch.nn.functional.normalize(eye - vertices, dim=-1)
-    faces_camera = (vertex_normals(vertices, rig.faces) * towards).sum(-1) > _FACING
+    faces_camera = (vertex_normals(vertices, faces) * towards).sum(-1) > _FACING
     x, y = pixels.floor().long().unbind(-1)
     is_inside = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
     x, y = x.clamp(0, camera.width - 1), y.clamp(0, camera.height - 1)
-    nearest = rasterize(vertices, rig.faces, camera).depth
-    return faces_camera & is_inside & frame.known[y, x] & (depths < nearest[y, x] + _HIDDEN)
+    nearest = rasterize(vertices, faces, camera).depth
+    known = frame.known.to(vertices.device)
+    return faces_camera & is_inside & known[y, x] & (depths < nearest[y, x] + _HIDDEN)
 
 
 def skin_regions(rig: Rig) -> dict[str, Int[Tensor, "_"]]:

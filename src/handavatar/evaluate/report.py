@@ -66,6 +66,7 @@ def write_report(
     title: str,
     metrics: Mapping[str, Figures],
     rows: Sequence[ReportRow] = (),
+    unseen: Sequence[ReportRow] = (),
     curves: Sequence[Curve] = (),
     notes: Sequence[str] = (),
     subtitle: str = "",
@@ -78,6 +79,7 @@ def write_report(
         metrics: figures by name; a group becomes a block of its own, and what is a group in it
             lines with longer names. ``mean``, ``low`` and ``high`` are printed as an interval.
         rows: frames with their pictures.
+        unseen: pictures that show which skin was never seen.
         curves: charts; those with fewer than two points are left out.
         notes: what a reader must know to judge the figures.
         subtitle: a line below the heading.
@@ -85,6 +87,7 @@ def write_report(
     sections = [
         _section("Figures", _metrics_html(metrics)),
         _section("Held-out frames", _rows_html(rows)),
+        _section("Skin that was never seen", _rows_html(unseen)),
         _section("Training", "".join(_curve_svg(curve) for curve in curves)),
         _section("Notes", "".join(f"<li>{escape(note)}</li>" for note in notes), tag="ul"),
     ]

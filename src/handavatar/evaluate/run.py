@@ -38,6 +38,7 @@ from handavatar.evaluate.report import (
     picture,
     write_report,
 )
+from handavatar.evaluate.unseen import unseen_figures, unseen_pictures
 from handavatar.fit.register import RegisterOptions
 from handavatar.hand.pose import HandPose
 from handavatar.jobs.files import FolderKind, claim_folder
@@ -124,7 +125,7 @@ def evaluate_run(
     protocols = _protocols(avatar, frames, capture.is_tracked, report)
     report(0.9, "measuring")
     metrics = _measured(options, capture, avatar, frames, protocols)
-    _write(out, metrics, capture, frames, protocols, options)
+    _write(out, metrics, avatar, capture, frames, protocols, options)
     return metrics
 
 
@@ -260,6 +261,7 @@ def _measured(
         "baseline": _baseline(avatar, capture, frames, main, color, colors, notes),
         "protocols": figures,
         "truth": truth,
+        "skin_never_seen": unseen_figures(avatar),
         "perceptual": distance.name,
         "notes": notes,
     }
@@ -393,6 +395,7 @@ def pictures_of(rendering: Rendering) -> dict[str, np.ndarray]:
 def _write(
     out: Path,
     metrics: dict[str, Any],
+    avatar: HandAvatar,
     capture: Capture,
     frames: list[Frame],
     protocols: dict[str, _Protocol],
@@ -427,11 +430,23 @@ def _write(
         f"protocol {name}; grey: nothing is known there",
         metrics={key: value for key, value in figures.items() if value is not None},
         rows=rows,
+        unseen=_unseen_rows(avatar),
         curves=_curves(options.run),
         notes=metrics["notes"],
     )
 
 
+def _unseen_rows(avatar: HandAvatar) -> list[ReportRow]:
+    figures = unseen_figures(avatar)
+    if figures is None:
+        return []
+    said = f"{100 * figures['share']:.0f} % of the skin, in violet: how it looks there is a guess"
+    if figures["regions"]:
+        said += f"; most of: {', '.join(figures['regions'])}"
+    return [ReportRow(said, unseen_pictures(avatar, _UNSEEN_SIZE))]
+
+
+_UNSEEN_SIZE = 192
 _SHEET = {
     "truth": "truth",
     "rendered": "avatar",

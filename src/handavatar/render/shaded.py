@@ -19,6 +19,7 @@ def shaded_mesh(
     faces: Int[Tensor, "faces 3"],
     camera: Camera,
     samples: int = 2,
+    colors: Float[Tensor, "vertices 3"] | None = None,
 ) -> Float[Tensor, "height width 3"]:
     """The mesh under a grazing light that moves with the camera, sRGB in [0, 1], on white.
 
@@ -27,6 +28,7 @@ def shaded_mesh(
         faces: outward winding.
         camera: the view.
         samples: picture elements are averages of this many squared.
+        colors: of the vertices, in place of clay.
     """
     fine = camera.resized(samples * camera.width, samples * camera.height)
     fragments = rasterize(vertices, faces, fine)
@@ -37,7 +39,8 @@ def shaded_mesh(
     for strength, towards in ((0.75, _KEY), (0.2, _FILL)):
         direction = torch.nn.functional.normalize(normals.new_tensor(towards), dim=0)
         light = light + strength * (normals @ direction).clamp_min(0)
-    color = light[..., None] * normals.new_tensor(_CLAY)
+    clay = normals.new_tensor(_CLAY)
+    color = light[..., None] * (clay if colors is None else interpolate(fragments, faces, colors))
     color = torch.where(fragments.mask[..., None], color, normals.new_tensor(_GROUND))
     height, width = camera.height, camera.width
     return color.reshape(height, samples, width, samples, 3).mean((1, 3)).clamp(0, 1)

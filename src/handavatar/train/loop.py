@@ -66,6 +66,7 @@ from handavatar.train.runs import (
     save_checkpoint,
     truncate_log,
 )
+from handavatar.train.seen_anchors import count_seen_anchors
 from handavatar.train.sky import place_directions, relit
 from handavatar.train.stopping import Interrupted, stop_signals
 
@@ -314,6 +315,7 @@ def train(options: TrainOptions) -> Path:
                 if stopped() and not is_last:
                     raise Interrupted(f"stopped at step {step}; continue with --resume auto")
         _learn_detail(training, frames, seen, perceptual, method, options.seed, stopped)
+        count_seen_anchors(training.avatar, corrected_frames(training, frames))
         training.avatar.save(run.avatar)
     return run.folder
 

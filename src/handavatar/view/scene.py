@@ -13,6 +13,8 @@ from handavatar.edit import bones_named
 from handavatar.hand.pose import FINGER_BONES, NUM_BONES
 
 LAYERS = ("rgb", "albedo", "illumination", "normal", "mesh")
+UNSEEN = "unseen"
+"""A layer of finished avatars: the picture with a tint on skin that no training frame saw."""
 SIZES = (64, 128, 192, 256, 384, 512)
 MOST_STROKES = 400
 MOST_STEPS = 100_000
@@ -110,7 +112,7 @@ class Scene:
             None leaves the fingers of the moment.
         turn: of the hand about the middle of its palm, axis-angle in its own axes, radians.
         orbit: the camera.
-        layer: one of ``LAYERS``.
+        layer: one of ``LAYERS``, or ``UNSEEN``.
         size: of the finished picture, pixels along a side; one of ``SIZES``.
         touches: the edits.
     """
@@ -177,7 +179,7 @@ def read_scene(content: Any) -> Scene:
         angles,
         _degrees(given.get("turn", [0, 0, 0]), "turn"),
         _orbit(given.get("orbit", {})),
-        _word(given.get("layer", "rgb"), "layer", LAYERS),
+        _word(given.get("layer", "rgb"), "layer", (*LAYERS, UNSEEN)),
         _size(given.get("size", 256)),
         read_touches(given.get("touches", {})),
     )

@@ -43,11 +43,12 @@ from handavatar.hand.pose_sampling import (
     rotations_from_angles,
 )
 from handavatar.render.shaded import shaded_mesh
-from handavatar.retouch import paint_of
+from handavatar.retouch import paint_of, tint_unseen
 from handavatar.view.baked import BakedAvatar, dabbed
 from handavatar.view.scene import (
     LAYERS,
     SIZES,
+    UNSEEN,
     Coat,
     Moment,
     Orbit,
@@ -114,6 +115,7 @@ class Studio:
         self._avatar = copy.copy(avatar)
         self._avatar.edit = Edit()
         self.start = avatar.edit
+        self._tint = None if avatar.seen_frames is None else tint_unseen(avatar)
         self.side = str(avatar.info.get("side", "right"))
         # The rest hand and its joints answer small questions, on the CPU and from any thread.
         self._rig = avatar.base_rig.to("cpu")
@@ -136,7 +138,7 @@ class Studio:
         return {
             "side": self.side,
             "subject": str(self._avatar.info.get("subject", "")),
-            "layers": list(LAYERS),
+            "layers": [*LAYERS, *(() if self._tint is None else (UNSEEN,))],
             "sizes": list(SIZES),
             "stages": list(STAGES),
             "most_picture_bytes": MOST_PICTURE_BYTES,
@@ -183,9 +185,15 @@ class Studio:
         """What the renderer needs for a scene.
 
         Raises:
-            SceneError: if the scene names a moment, an anchor or a picture that there is not.
+            SceneError: if the scene names a moment, an anchor, a picture or a layer that there
+                is not.
         """
-        return Shot(self.pose(scene), self._camera(scene), self.edit(scene.touches))
+        edit = self.edit(scene.touches)
+        if scene.layer == UNSEEN:
+            if self._tint is None:
+                raise SceneError(f"layer: this avatar does not know what was seen, no {UNSEEN!r}")
+            edit = edit.then(self._tint)
+        return Shot(self.pose(scene), self._camera(scene), edit)
 
     def pose(self, scene: Scene) -> HandPose:
         """The hand of a scene, in the world.
@@ -225,7 +233,7 @@ class Studio:
             vertices = self._baked.posed(shot.pose).posed.vertices
             return mesh_picture(vertices, self._avatar, shot, 1)
         rendering = self._baked.render(shot.pose, shot.camera, shot.edit)
-        return pass_pictures(rendering, self.side)[scene.layer]
+        return layer_picture(rendering, self.side, scene.layer)
 
     def refined(self, scene: Scene, stage: str, is_stale: Callable[[], bool]) -> Pixels:
         """The picture by the field; the last stage is what ``handavatar render`` gives.
@@ -423,7 +431,7 @@ def refined_picture(
     Args:
         avatar: whose.
         shot: of :func:`size_at`.
-        layer: one of ``LAYERS``.
+        layer: one of ``LAYERS``, or ``UNSEEN``.
         stage: ``half`` or ``full``.
         settings: of the stage ``full``.
         is_stale: asked every few milliseconds whether to go on.
@@ -436,7 +444,18 @@ def refined_picture(
     if stage != STAGES[-1]:
         settings = replace(settings, num_samples=settings.num_samples // 2 or 1, edge_rays=1)
     rendering = rendered(avatar, shot, settings, is_stale)
-    return pass_pictures(rendering, str(avatar.info.get("side", "right")))[layer]
+    return layer_picture(rendering, str(avatar.info.get("side", "right")), layer)
+
+
+def layer_picture(rendering: Rendering, side: str, layer: str) -> Pixels:
+    """A layer of a rendering; mirrored back if it is a left hand.
+
+    Args:
+        rendering: by the field or from the mesh, of the shot's edit.
+        side: ``left`` or ``right``.
+        layer: one of ``LAYERS`` but ``mesh``, or ``UNSEEN``: the tint is in the shot's edit.
+    """
+    return pass_pictures(rendering, side)["rgb" if layer == UNSEEN else layer]
 
 
 def rendered(

@@ -345,6 +345,7 @@ function wire() {
     const line = Object.assign(document.createElement("label"), { className: "tick" });
     const input = Object.assign(document.createElement("input"), { type: "radio", name: "layer", value: layer, checked: layer === "rgb" });
     line.append(input, layer);
+    if (layer === "unseen") line.title = "in violet: skin that no picture of the video showed; how it looks there is a guess";
     input.addEventListener("change", () => { scene.layer = layer; changed(); });
     $("layers").append(line);
   }
