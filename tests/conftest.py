@@ -101,11 +101,12 @@ def write_tiny_capture(
     splits: str = "aaabb",
     confidence: float = 1.0,
     rig: Rig | None = None,
+    size: int = 48,
     **header: str,
 ) -> Path:
-    """A capture of 48 x 48 pictures: ``a`` stands for a training frame, ``b`` for a test frame."""
+    """A capture of small pictures: ``a`` stands for a training frame, ``b`` for a test frame."""
     frames = [
-        lit_frame(index, {"a": "train", "b": "test"}[letter], confidence, rig=rig)
+        lit_frame(index, {"a": "train", "b": "test"}[letter], confidence, size, rig)
         for index, letter in enumerate(splits)
     ]
     rig = rig or load_open_hand()

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import lit_frame
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
@@ -432,3 +433,30 @@ def test_gains_that_make_no_sense_are_refused(tmp_path: Path, gain: list[float])
     file.write_text(json.dumps(content))
     with pytest.raises(CaptureError, match="gain"):
         read_capture(tmp_path / "c")
+
+
+def test_binning_averages_whole_blocks_and_keeps_the_view() -> None:
+    frame = lit_frame(1, "train", size=96)
+    known = torch.ones(96, 96, dtype=torch.bool)
+    known[10, 20] = False
+    frame = replace(frame, known=known)
+    small = frame.binned(48)
+    assert small.image.shape == (48, 48, 3) and small.camera.width == small.camera.height == 48
+    block = frame.image[40:42, 60:62].float().mean((0, 1))
+    assert bool(((small.image[20, 30].float() - block).abs() <= 0.5).all())
+    assert not bool(small.known[5, 10]) and int((~small.known).sum()) == 1
+    assert small.image.dtype == small.coverage.dtype == torch.uint8
+    # A point of the hand lies at the same place of the picture.
+    point = frame.pose.translation[None]
+    large, little = (project(each.camera, point)[0] for each in (frame, small))
+    assert torch.allclose(large, 2 * little)
+    # As the same hand photographed with half the pixels.
+    direct = lit_frame(1, "train", size=48)
+    assert float((small.alpha - direct.alpha).abs().mean()) < 0.02
+
+
+@pytest.mark.parametrize("side", [64, 49, 96, 200])
+def test_what_is_not_twice_as_large_stays(side: int) -> None:
+    frame = lit_frame(1, "train", size=96)
+    assert frame.binned(side) is frame
+    assert lit_frame(1, "train", size=50).binned(16).camera.width == 50  # 50 is no multiple of 3

@@ -26,6 +26,7 @@ from handavatar.capture.video import (
     capture_video,
     held_out_splits,
     splits_by_index,
+    stored_size,
     summary_lines,
 )
 from handavatar.capture.windows import Window
@@ -124,6 +125,32 @@ def test_a_hand_that_leaves_the_picture_is_rejected_by_that_name(
         assert bool(beyond.any()) and not bool(frame.known[:, beyond].any())
         assert not bool(frame.coverage[~frame.known].any())
         assert bool((frame.image[:, beyond] == 128).all())
+
+
+def test_pictures_are_stored_as_large_as_the_video_shows_the_hand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the fine surroundings, not from those in which the mask is found."""
+    pytest.importorskip("cv2")
+    assert [stored_size(sides) for sides in ([300.0, 511.0], [511.0, 600.0, 700.0])] == [256, 512]
+    options, rig = _made_video(tmp_path, monkeypatch, PICTURE[0])
+    track = video_module.track_hand()
+    striped = []
+    for hand in track.hands:
+        image = hand.window.image.repeat(2, 0).repeat(2, 1)
+        image[:, ::2] = 0  # finer than the window can show
+        fine = Window(image, CORNER, 2.0, hand.window.picture_size)
+        striped.append(replace(hand, fine=fine))
+    fine_track = replace(track, hands=tuple(striped))
+    monkeypatch.setattr(video_module, "track_hand", lambda *_: fine_track)
+    for asked, expected in ((None, 256), (512, 512)):
+        out = tmp_path / f"stored{expected}"
+        frame = capture_video(replace(options, out=out, size=asked), rig).frame(0)
+        assert frame.camera.width == frame.image.shape[1] == expected
+        colors = frame.image[frame.mask].float()
+        # A pixel of 512 is less than two of the fine stripes wide: some are nearly black.
+        assert 40 < float(colors.mean()) < 110
+    assert float((colors.mean(-1) < 20).float().mean()) > 0.1
 
 
 _MADE = 9

@@ -155,6 +155,12 @@ def test_masked_protocol_ignores_what_is_far_from_both_hands() -> None:
     assert paper_scores([spoilt]).psnr < paper_scores([judged]).psnr - 3
 
 
+def test_the_margin_is_the_same_share_of_larger_pictures() -> None:
+    truth, mask = blobs(4, 512, 512), disc(60, 512, 512)
+    judged = JudgedFrame(truth * mask[..., None], mask, truth, mask.float())
+    assert torch.equal(judged.region(), dilated(mask, 2 * REGION_MARGIN))
+
+
 def test_black_background_inflates_the_papers_psnr_by_the_regions_share() -> None:
     judged = frame(3)
     share = float(judged.region().float().mean())

@@ -30,6 +30,7 @@ from handavatar.train.loop import (
     patch_pixels,
     train,
     train_step,
+    training_frames,
 )
 from handavatar.train.outlines import EdgeSet
 from handavatar.train.prior import SHIPPED_PRIOR
@@ -462,3 +463,28 @@ def test_a_run_of_another_seed_is_not_continued(tiny_capture: Path, tmp_path: Pa
         train(replace(options, seed=options.seed + 1))
     with pytest.raises(ValueError, match="--steps 0"):
         train(replace(options, steps=0))
+
+
+def test_large_pictures_are_binned_for_all_but_the_detail(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_tiny_capture(tmp_path / "large", "ab", size=96)
+    capture = read_capture(folder)
+    method = replace(TINY, picture_size=48, detail_size=32, detail_steps=2)
+    assert {frame.camera.width for frame in training_frames(capture, method)} == {48}
+    assert {frame.camera.width for frame in training_frames(capture, METHODS["paper"])} == {96}
+    monkeypatch.setitem(METHODS, "quick", method)
+    widths: dict[str, set[int]] = {}
+    for name in ("find_seen_samples", "learn_detail"):
+        work = getattr(loop, name)
+
+        def spied(
+            avatar: HandAvatar, frames: Any, *rest: Any, name: str = name, work: Any = work
+        ) -> Any:
+            widths[name] = {frame.camera.width for frame in frames}
+            return work(avatar, frames, *rest)
+
+        monkeypatch.setattr(loop, name, spied)
+    avatar = HandAvatar.load(train(_options(folder, tmp_path / "run", steps=4)))
+    assert widths == {"find_seen_samples": {48}, "learn_detail": {96}}
+    assert avatar.texture is not None and bool(avatar.texture.texels.any())

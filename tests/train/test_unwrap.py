@@ -69,6 +69,22 @@ def _view(
     )
 
 
+def _enlarged(view: UnwrapView) -> UnwrapView:
+    """The same view with every pixel made four."""
+    grown = {
+        name: getattr(view, name).repeat_interleave(2, 0).repeat_interleave(2, 1)
+        for name in ("residual", "is_known")
+    }
+    # Places run on between the pixels, as those of a finer picture do.
+    places = torch.nn.functional.interpolate(
+        view.places.movedim(-1, 0)[None], scale_factor=2, mode="bilinear", align_corners=False
+    )[0].movedim(0, -1)
+    camera = view.camera.resized(2 * view.camera.width, 2 * view.camera.height)
+    return UnwrapView(
+        **(vars(view) | grown | {"places": places, "camera": camera, "pixel": 2.0 * view.pixel})
+    )
+
+
 def _unwrapped(*views: UnwrapView) -> tuple[torch.Tensor, torch.Tensor]:
     found = unwrap_pictures(list(views), FACES, _texels(), CORNERS)
     return found.residual, found.seen
@@ -142,3 +158,17 @@ def test_the_median_of_weights_is_where_half_of_them_lies() -> None:
         found = weighted_median(values, torch.tensor(weights)[:, None].float())
         assert float(found) == expected
     assert math.isfinite(float(weighted_median(values, torch.zeros(3, 1))))
+
+
+def test_a_surface_beside_the_mesh_is_found_in_larger_pictures_too() -> None:
+    """The shift that is still believed is a share of the picture, not a number of pixels."""
+    eye = (-0.05, 0.05, -0.2)
+    # More than two pixels of the small picture, more than four of the large one.
+    view = _view(eye, beside=0.008)
+    small, large = _unwrapped(view), _unwrapped(_enlarged(view))
+    assert float((small[1] > 0).float().mean()) > 0.6
+    assert abs(float((small[1] > 0).float().mean() - (large[1] > 0).float().mean())) < 0.05
+    both = (small[1] > 0) & (large[1] > 0)
+    assert float((small[0] - large[0])[both].abs().mean()) < 0.03
+    as_if_small = UnwrapView(**(vars(_enlarged(view)) | {"pixel": 1.0}))
+    assert float((_unwrapped(as_if_small)[1] > 0).float().mean()) < 0.3

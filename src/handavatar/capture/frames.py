@@ -17,7 +17,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -167,6 +167,32 @@ class Frame:
     def shown(self) -> UInt8[Tensor, "height width 3"]:
         """The picture for people to look at: grey where nothing is known."""
         return torch.where(self.known[..., None], self.image, self.image.new_tensor(_UNKNOWN_GREY))
+
+    def binned(self, side: int) -> "Frame":
+        """The same frame with square blocks of pixels averaged, as large ones as leave it ``side``.
+
+        A block is known if all of it is. A picture that is not twice as large, or whose sides are
+        no multiple of such blocks, stays as it is.
+
+        Args:
+            side: pixels that the longer side keeps at least.
+        """
+        width, height = self.camera.width, self.camera.height
+        factor = max(1, max(width, height) // side)
+        if factor == 1 or width % factor or height % factor:
+            return self
+
+        def means(values: Tensor) -> Tensor:
+            blocks = values.unflatten(0, (-1, factor)).unflatten(2, (-1, factor))
+            return blocks.float().mean((1, 3))
+
+        return replace(
+            self,
+            image=means(self.image).round().to(torch.uint8),
+            coverage=means(self.coverage).round().to(torch.uint8),
+            camera=self.camera.resized(width // factor, height // factor),
+            known=means(self.known) == 1,
+        )
 
 
 @dataclass(frozen=True, eq=False)

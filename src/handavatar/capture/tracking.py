@@ -17,7 +17,7 @@ from PIL import Image
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import VideoFrame
-from handavatar.capture.windows import Window, resampled, window_around
+from handavatar.capture.windows import FINE_SIDE, Window, resampled, window_around
 
 NUM_LANDMARKS = 21
 LANDMARK_NAMES: tuple[str, ...] = (
@@ -66,11 +66,13 @@ class TrackedHand:
     Attributes:
         index: number of the frame in the file.
         time: seconds from the start.
-        window: the surroundings of the hand.
+        window: the surroundings of the hand, in which its mask is found.
         landmarks: pixels of the whole (possibly mirrored) picture.
         spread: disagreement of the looks per landmark, pixels.
         world_landmarks: metres about the hand's centre, camera axes.
         presence: the tracker's certainty, in [0, 1].
+        fine: the same surroundings with up to twice the pixels, from which the picture is stored;
+            the window itself if it is left out.
     """
 
     index: int
@@ -80,6 +82,12 @@ class TrackedHand:
     spread: Float[np.ndarray, "21"]
     world_landmarks: Float[np.ndarray, "21 3"]
     presence: float
+    fine: Window = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        """The window is as fine as any where the picture has no more pixels."""
+        if self.fine is None:
+            object.__setattr__(self, "fine", self.window)
 
     def mirrored(self) -> "TrackedHand":
         """The same hand in the mirrored picture."""
@@ -88,6 +96,7 @@ class TrackedHand:
         return replace(
             self,
             window=self.window.mirrored(),
+            fine=self.fine.mirrored(),
             landmarks=self.landmarks * flip + shift,
             world_landmarks=self.world_landmarks * np.array([-1.0, 1.0, 1.0]),
         )
@@ -320,10 +329,12 @@ def _combined(finder: HandFinder, frame: VideoFrame, first: Sighting) -> Tracked
     # A hand that only one look has found is as uncertain as a tenth of its size.
     unsure = 0.1 * size if len(looks) == 1 else 0.0
     spread = np.linalg.norm(landmarks - middle, axis=-1).max(0) + unsure
+    window = window_around(frame.image, middle)
     return TrackedHand(
         index=frame.index,
         time=frame.time,
-        window=window_around(frame.image, middle),
+        window=window,
+        fine=window if window.scale >= 1 else window_around(frame.image, middle, FINE_SIDE),
         landmarks=middle,
         spread=spread,
         world_landmarks=np.median(np.stack([look.world_landmarks for look in looks]), axis=0),

@@ -81,6 +81,7 @@ Progress = Callable[[float, str], None]
 """Told the share of the work that is done, in [0, 1], and what is being done."""
 
 _BOX_SCALE = 1.3
+_SIZES = (256, 512)
 _WRIST_MARGIN = 0.008
 """Metres before the rig's end from where on masks are believed."""
 _HELD_OUT = ((0.28, 0.08), (0.68, 0.08))
@@ -112,8 +113,8 @@ class VideoOptions:
     """Stop after this many pictures."""
     side: Literal["auto", "left", "right"] = "auto"
     """Which hand it is; auto takes the video as not mirrored."""
-    size: int = 256
-    """Side of the stored pictures, pixels."""
+    size: int | None = None
+    """Side of the stored pictures, pixels; by default 512 where hands are as large, else 256."""
     min_confidence: float = 0.5
     """Frames whose pose is less sure are left out, by name."""
     subject: str = "unnamed"
@@ -340,9 +341,15 @@ def _laid_on(
     except CaptureError as error:
         raise _failure(options, error.what, error.remedy, track, []) from error
 
+    boxes = [
+        _box_in_front(hand, mask, rig, fitted, number)
+        for number, (hand, mask) in enumerate(zip(track.hands, guided, strict=True))
+    ]
+    size = options.size or stored_size([box.side for box in boxes])
+
     def cropped(number: int) -> FittedFrame:
-        hand, mask = track.hands[number], guided[number]
-        return _result(hand, mask, rig, fitted, number, gains[number], options)
+        hand, mask, box = track.hands[number], guided[number], boxes[number]
+        return _result(hand, mask, box, rig, fitted, number, gains[number], size, options)
 
     results = _on_all_cores(
         cropped, range(len(guided)), lambda share: report(0.9 + 0.05 * share, "cropping")
@@ -470,36 +477,75 @@ def _known_before_wrist(
     return found
 
 
+@dataclass(frozen=True)
+class _Box:
+    """The square of a picture that is stored.
+
+    Attributes:
+        corner: upper left one, pixels of the video's picture.
+        side: pixels of the video's picture.
+    """
+
+    corner: tuple[float, float]
+    side: float
+
+    def seen_in(self, window: Window) -> tuple[tuple[float, float], float]:
+        """Its corner and side in pixels of a window."""
+        x, y = (
+            (at - start) * window.scale
+            for at, start in zip(self.corner, window.corner, strict=True)
+        )
+        return (x, y), self.side * window.scale
+
+
+def _box_in_front(
+    hand: TrackedHand, guided: GuidedMask, rig: Rig, fitted: FittedHands, number: int
+) -> _Box:
+    """About the mask in front of the wrist."""
+    window, rim = hand.window, rig.rim.numpy()
+    side = window.image.shape[0]
+    places = project(window_view(hand, fitted.fit.focal), fitted.vertices[number])[0]
+    in_window = places.double().numpy()
+    before = wrist_line(in_window[rim], in_window.mean(0)).before_pixels(side) > 0
+    corner, box = _box(guided.mask.pixels & before & inside_picture(window))
+    x, y = (start + at / window.scale for start, at in zip(window.corner, corner, strict=True))
+    return _Box((x, y), box / window.scale)
+
+
+def stored_size(sides: Sequence[float]) -> int:
+    """Pixels along a side of the stored pictures: as many as most of the video's hands have.
+
+    Args:
+        sides: of the squares about the hands, pixels of the video.
+    """
+    return _SIZES[1] if float(np.median(sides)) >= _SIZES[1] else _SIZES[0]
+
+
 def _result(
     hand: TrackedHand,
     guided: GuidedMask,
+    box: _Box,
     rig: Rig,
     fitted: FittedHands,
     number: int,
     gain: Float[np.ndarray, "3"],
+    size: int,
     options: VideoOptions,
 ) -> FittedFrame:
     """One frame's crop, with its mask cut where the mesh ends."""
-    window, size = hand.window, options.size
+    window = hand.window
     fit, vertices = fitted.fit, fitted.vertices[number]
-    side = window.image.shape[0]
     rim = rig.rim.numpy()
-    whole = window_camera(fit.focal, window.picture_size, window.corner, side / window.scale, side)
-    places = project(whole, vertices)[0].double().numpy()
-    before = wrist_line(places[rim], places.mean(0)).before_pixels(side) > 0
-    corner, box = _box(guided.mask.pixels & before & inside_picture(window))
-    camera = window_camera(
-        fit.focal,
-        window.picture_size,
-        (window.corner[0] + corner[0] / window.scale, window.corner[1] + corner[1] / window.scale),
-        box / window.scale,
-        size,
-    )
-    zoom = np.eye(2) * (box / size)
-    image = resampled(window.image, zoom, np.array(corner), size).copy()
+    camera = window_camera(fit.focal, window.picture_size, box.corner, box.side, size)
+    fine_corner, fine_side = box.seen_in(hand.fine)
+    image = resampled(
+        hand.fine.image, np.eye(2) * (fine_side / size), np.array(fine_corner), size
+    ).copy()
+    corner, side = box.seen_in(window)
+    zoom = np.eye(2) * (side / size)
     shares = mask_coverage(guided.mask.level, zoom, np.array(corner), size)
     known = resampled(grey_picture(guided.known), zoom, np.array(corner), size)[..., 0] == 255
-    was_seen = _is_in_view(window, corner, box, size)
+    was_seen = _is_in_view(window, corner, side, size)
     image[~was_seen] = 128
 
     fine_camera = camera.resized(SUBPIXELS * size, SUBPIXELS * size)

@@ -11,7 +11,10 @@ from PIL import Image
 from handavatar.geometry.cameras import Camera
 
 _SURROUNDINGS = 1.9
-_MAX_SIDE = 448
+MASK_SIDE = 448
+"""Pixels along a side of the surroundings in which masks are found, at most."""
+FINE_SIDE = 896
+"""Pixels along a side of the surroundings from which pictures are stored, at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +111,20 @@ def _view_corners(
 
 
 def window_around(
-    image: UInt8[np.ndarray, "height width 3"], landmarks: Float[np.ndarray, "21 2"]
+    image: UInt8[np.ndarray, "height width 3"],
+    landmarks: Float[np.ndarray, "21 2"],
+    most: int = MASK_SIDE,
 ) -> Window:
-    """The surroundings of a hand: room for the wrist and for its errors on every side."""
+    """The surroundings of a hand: room for the wrist and for its errors on every side.
+
+    Args:
+        image: the whole picture.
+        landmarks: of the hand, pixels.
+        most: pixels along a side; a larger hand is made smaller.
+    """
     low, high = landmarks.min(0), landmarks.max(0)
     side = float((high - low).max()) * _SURROUNDINGS
-    pixels = int(min(_MAX_SIDE, max(128, round(side))))
+    pixels = int(min(most, max(128, round(side))))
     corner = (low + high) / 2 - side / 2
     picture_from_view = np.eye(2) * (side / pixels)
     return Window(

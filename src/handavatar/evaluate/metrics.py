@@ -20,7 +20,8 @@ PSNR_CEILING = 100.0
 """Decibels given to equal pictures, whose ratio is infinite: means stay finite, JSON valid."""
 
 REGION_MARGIN = 8.0
-"""Pixels around both masks that the masked protocol judges too."""
+"""Pixels around both masks that the masked protocol judges too; in pictures wider than 256, as much
+of the picture as in these."""
 
 CORE_DEPTH = 6 / 256
 """Of the picture's width: deeper inside both masks lies the core, where no outline is judged."""
@@ -185,7 +186,8 @@ class JudgedFrame:
         union = self.seen_mask | self.truth_mask
         if not bool(union.any()):
             raise ValueError("neither the photograph nor the rendering shows a hand")
-        return dilated(union, REGION_MARGIN) & self.known
+        margin = REGION_MARGIN * max(1.0, union.shape[1] / 256)
+        return dilated(union, margin) & self.known
 
     def core(self) -> Bool[Tensor, "height width"]:
         """Pixels deeper than ``CORE_DEPTH`` inside both masks: no outline is judged there.

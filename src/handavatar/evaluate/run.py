@@ -169,12 +169,17 @@ def _rendered(
     return _Protocol(poses, renderings, judged)
 
 
+_FITTED_SIZE = 256
+"""Pixels along a side of the pictures that hands are laid onto."""
+
+
 def held_out_poses(avatar: HandAvatar, frames: list[Frame]) -> list[HandPose]:
     """Poses by landmarks and masks alone, never by colours.
 
     Training corrects the poses of its own frames; held-out frames get the same chance, with the
-    avatar's shape as it is.
+    avatar's shape as it is, and pictures as large as training takes them.
     """
+    frames = [frame.binned(_FITTED_SIZE) for frame in frames]
     hands = [fitted_hand(avatar, frame.pose) for frame in frames]
     options = RegisterOptions(
         pose_error=float(avatar.info.get("pose_error", RegisterOptions.pose_error)),

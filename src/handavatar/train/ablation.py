@@ -65,6 +65,7 @@ from handavatar.train.loop import (
     begin_training,
     corrected_frames,
     fit_geometry,
+    training_frames,
 )
 from handavatar.train.losses import color_loss
 from handavatar.train.muon import Muon
@@ -290,7 +291,7 @@ class FittedGeometry:
 
 def fitted_geometry(capture: Capture, shape: Shape, method: Method, seed: int) -> FittedGeometry:
     """Fits shape, poses and decoder to the masks, and finds what each picture sees."""
-    frames = [capture.frame(index) for index in capture.split("train")]
+    frames = training_frames(capture, method)
     method = replace(
         method,
         cues=TracedCues(),

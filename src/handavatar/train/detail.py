@@ -331,6 +331,7 @@ def _unwrap_view(avatar: HandAvatar, frame: Frame, view: DetailView) -> UnwrapVi
     camera = frame.camera.to("cpu")
     _, depths = project(camera, vertices)
     sigma = _FINE * camera.focal[0] / float(depths.mean())
+    pixel = camera.width / 256
     return UnwrapView(
         residual=fine_part(wanted, is_known, sigma),
         places=view.places.cpu(),
@@ -338,7 +339,8 @@ def _unwrap_view(avatar: HandAvatar, frame: Frame, view: DetailView) -> UnwrapVi
         camera=camera.cropped(float(view.left), float(view.top), float(width), float(height)),
         vertices=vertices,
         sharpness=sharpness,
-        fit_error=outline_error(vertices, avatar.rig.to("cpu").faces, frame),
+        fit_error=outline_error(vertices, avatar.rig.to("cpu").faces, frame) / pixel,
+        pixel=pixel,
     )
 
 

@@ -110,6 +110,8 @@ class Method:
         decay: all learning rates fall by this factor until the end, exponentially.
         occupancy_points: labelled points per frame for L_PairOF.
         occupancy_every: L_PairOF is taken at every so many steps.
+        picture_size: pixels along a side from which all but the detail is learned; larger pictures
+            are made smaller for it. None takes them as they are.
         rounds: midpoint subdivisions of the rig's mesh.
         num_anchors: anchors on the surface.
         detail_size: texels along a side of the texture that is learned last (``train.detail``); 0
@@ -145,6 +147,7 @@ class Method:
     decay: float = 0.1
     occupancy_points: int = 1024
     occupancy_every: int = 1
+    picture_size: int | None = 256
     rounds: int = 2
     num_anchors: int = 4096
     detail_size: int = 0
@@ -200,6 +203,7 @@ METHODS: dict[str, Method] = {
         patch_size=32,
         num_samples=64,
         silhouette_size=256,
+        picture_size=None,
         corrects_poses=False,
         outline_rounds=0,
     ),
@@ -278,7 +282,7 @@ def train(options: TrainOptions) -> Path:
         raise CaptureError(
             f"{capture.folder}: no frame of split 'train'", "mark some frames as split: train"
         )
-    frames = [capture.frame(index) for index in indices]
+    frames = training_frames(capture, method)
     perceptual = perceptual_loss(options.perceptual).to(device)
     training = begin_training(capture, frames, method, options)
     training.avatar.info["view"] = view_of(frames)
@@ -314,14 +318,23 @@ def train(options: TrainOptions) -> Path:
                     _save(run, training, outlines, step)
                 if stopped() and not is_last:
                     raise Interrupted(f"stopped at step {step}; continue with --resume auto")
-        _learn_detail(training, frames, seen, perceptual, method, options.seed, stopped)
+        _learn_detail(training, capture, frames, seen, perceptual, method, options.seed, stopped)
         count_seen_anchors(training.avatar, corrected_frames(training, frames))
         training.avatar.save(run.avatar)
     return run.folder
 
 
+def training_frames(capture: Capture, method: Method) -> list[Frame]:
+    """The frames of split ``train``, as large as the method takes them."""
+    frames = (capture.frame(index) for index in capture.split("train"))
+    if method.picture_size is None:
+        return list(frames)
+    return [frame.binned(method.picture_size) for frame in frames]
+
+
 def _learn_detail(
     training: Training,
+    capture: Capture,
     frames: list[Frame],
     seen: SeenSamples | None,
     perceptual: PerceptualLoss,
@@ -332,10 +345,15 @@ def _learn_detail(
     """The texture, from the last checkpoint on: whoever is stopped here begins it anew."""
     if not method.detail_size:
         return
-    avatar, corrected = training.avatar, corrected_frames(training, frames)
+    avatar = training.avatar
     if seen is None:
         settings = RenderSettings(num_samples=method.num_samples)
-        seen = find_seen_samples(avatar, corrected, settings, _DETAIL_STRIDE)
+        small = corrected_frames(training, frames)
+        seen = find_seen_samples(avatar, small, settings, _DETAIL_STRIDE)
+    # Here the pictures count as large as they are.
+    corrected = corrected_frames(
+        training, training_frames(capture, replace(method, picture_size=None))
+    )
 
     def end_if_stopped() -> None:
         if stopped():

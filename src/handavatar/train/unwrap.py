@@ -19,11 +19,11 @@ from handavatar.render.chart import Texels
 from handavatar.render.rasterize import rasterize
 
 _FIT_SCALE = 1.5
-"""Pixels of a frame's fit error that leave it a weight of exp(-1)."""
+"""Pixels (of 256) of a frame's fit error that leave it a weight of exp(-1)."""
 _SAME_DEPTH = 4e-3
 """Metres that a texel may lie behind the nearest surface within a pixel around it."""
 _LARGEST_SHIFT = 3.0
-"""Pixels between a point of the mesh and where the picture shows it, at most."""
+"""Pixels (of 256) between a point of the mesh and where the picture shows it, at most."""
 _LEAST_COSINE = 0.1
 _WHOLE = 0.999
 _FRAMES = 24
@@ -45,7 +45,8 @@ class UnwrapView:
         camera: of these pixels.
         vertices: of the posed fine mesh, metres, world.
         sharpness: of the picture, relative to others.
-        fit_error: mean distance between the outlines of mesh and mask, pixels.
+        fit_error: mean distance between the outlines of mesh and mask, pixels of 256.
+        pixel: as many of the view's pixels are one of a picture 256 wide.
     """
 
     residual: Float[Tensor, "height width 3"]
@@ -55,6 +56,7 @@ class UnwrapView:
     vertices: Float[Tensor, "vertices 3"]
     sharpness: float
     fit_error: float
+    pixel: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +204,7 @@ def _looked_up(
     shifted = (
         torch.stack([x, y], dim=-1) + 0.5 + (part.pixels_per_uv[faces] @ away[..., None])[..., 0]
     )
-    is_visible &= (shifted - pixels).square().sum(-1) < _LARGEST_SHIFT**2
+    is_visible &= (shifted - pixels).square().sum(-1) < (_LARGEST_SHIFT * view.pixel) ** 2
     pixels = torch.where(is_visible[:, None], shifted, pixels) - 0.5
     lower = pixels.floor()
     share = pixels - lower
