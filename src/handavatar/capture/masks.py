@@ -317,13 +317,20 @@ def mask_coverage(
         size: side of the view, pixels.
     """
     fine = resampled(grey_picture(level), window_from_view / SUBPIXELS, corner, SUBPIXELS * size)
-    return covered_shares(fine[..., 0] > 127)
+    return covered_shares(fine[..., 0] > 127, SUBPIXELS)
 
 
-def covered_shares(fine: Bool[np.ndarray, "fine fine"]) -> Float[np.ndarray, "side side"]:
-    """How much of each pixel is true, in [0, 1], of a mask of ``SUBPIXELS`` times the size."""
-    side = len(fine) // SUBPIXELS
-    return fine.reshape(side, SUBPIXELS, side, SUBPIXELS).mean(axis=(1, 3))
+def covered_shares(
+    fine: Bool[np.ndarray, "fine fine"], samples: int
+) -> Float[np.ndarray, "side side"]:
+    """How much of each pixel is true, in [0, 1].
+
+    Args:
+        fine: a mask of so many times the size.
+        samples: along a side of a pixel.
+    """
+    side = len(fine) // samples
+    return fine.reshape(side, samples, side, samples).mean(axis=(1, 3))
 
 
 def grey_picture(values: np.ndarray) -> UInt8[np.ndarray, "height width 3"]:

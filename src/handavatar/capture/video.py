@@ -36,7 +36,6 @@ from handavatar.capture.guided_masks import (
     wrist_line,
 )
 from handavatar.capture.masks import (
-    SUBPIXELS,
     HandMask,
     covered_shares,
     find_mask,
@@ -82,6 +81,8 @@ Progress = Callable[[float, str], None]
 
 _BOX_SCALE = 1.3
 _SIZES = (256, 512)
+# Pixels along a side at which the fitted mesh is compared with its mask.
+_MESH_SIDE = 768
 _WRIST_MARGIN = 0.008
 """Metres before the rig's end from where on masks are believed."""
 _HELD_OUT = ((0.28, 0.08), (0.68, 0.08))
@@ -548,8 +549,9 @@ def _result(
     was_seen = _is_in_view(window, corner, side, size)
     image[~was_seen] = 128
 
-    fine_camera = camera.resized(SUBPIXELS * size, SUBPIXELS * size)
-    mesh = covered_shares(silhouette(rig, vertices, fine_camera))
+    samples = max(1, _MESH_SIDE // size)
+    fine_camera = camera.resized(samples * size, samples * size)
+    mesh = covered_shares(silhouette(rig, vertices, fine_camera), samples)
     in_crop = project(camera, vertices)[0].double().numpy()
     line = wrist_line(in_crop[rim], in_crop.mean(0))
     scale = camera.focal[0] / max(float(vertices[:, 2].median()), 0.02)
