@@ -351,3 +351,26 @@ def test_a_run_folder_names_its_capture_and_shows_its_curves(
     evaluate_run(EvaluateOptions(run, max_frames=1, device="cpu"))
     report = (run / "evaluation" / "report.html").read_text()
     assert "psnr, mean of 20 steps" in report
+
+
+def test_large_pictures_are_judged_binned_unless_asked_for_whole(
+    avatar_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_module, "_FITTED_SIZE", 48)
+    folder = write_tiny_capture(tmp_path / "large", "aab", size=96)
+    for kind in ("albedo", "shading"):
+        (folder / "truth" / kind).mkdir(parents=True)
+        pixels = np.full((96, 96, 3), 128, dtype=np.uint8)
+        Image.fromarray(pixels).save(folder / "truth" / kind / "000002.png")
+    for full_size, side in ((False, 48), (True, 96)):
+        out = tmp_path / f"out{side}"
+        options = EvaluateOptions(avatar_file, folder, out=out, full_size=full_size, device="cpu")
+        metrics = evaluate_run(options)
+        with Image.open(out / "000002.png") as strip:
+            assert strip.height == side
+        notes = [note for note in metrics["notes"] if "--full-size" in note]
+        assert bool(notes) != full_size
+        assert metrics["truth"] is not None and metrics["truth"]["albedo_psnr"] > 0
+    assert "48 pixels along a side, of 96" in "".join(
+        json.loads((tmp_path / "out48" / "metrics.json").read_text())["notes"]
+    )

@@ -54,6 +54,8 @@ def textured_mesh_psnr(
     count = min(MESH_FRAMES, len(indices))
     places = torch.linspace(0, len(indices) - 1, count).round().long().tolist()
     training = [capture.frame(indices[place]) for place in places]
+    if frames:  # As large as what is judged.
+        training = [frame.binned(frames[0].camera.width) for frame in training]
     found = zip(training, poses_of(training), strict=True)
     training = [replace(frame, pose=pose) for frame, pose in found]
     picture_of = fit_textured_mesh(avatar, training, color, MESH_STEPS, seed=0, rays=1)

@@ -66,6 +66,9 @@ class EvaluateOptions:
         out: folder for pictures, ``metrics.json`` and ``report.html``; by default
             ``evaluation`` in the run.
         max_frames: judge at most so many frames, evenly spread over the split.
+        full_size: judge pictures as large as the capture stores them; otherwise those that are
+            twice as large or larger are binned to 256 pixels along a side, so that figures
+            compare, and four times as soon.
         device: where the fields run.
     """
 
@@ -74,6 +77,7 @@ class EvaluateOptions:
     split: str = "test"
     out: Path | None = None
     max_frames: int | None = None
+    full_size: bool = False
     device: str = "auto"
 
 
@@ -121,6 +125,8 @@ def evaluate_run(
         )
     claim_folder(out, EVALUATION)
     frames = [capture.frame(index) for index in indices]
+    if not options.full_size:
+        frames = [frame.binned(_FITTED_SIZE) for frame in frames]
     report = progress or (lambda share, doing: None)
     protocols = _protocols(avatar, frames, capture.is_tracked, report)
     report(0.9, "measuring")
@@ -152,16 +158,22 @@ def _protocols(
     return {"mask": fitted, "registered": registered}
 
 
+_AT_ONCE = 4
+"""Pictures that are rendered side by side before progress is told."""
+
+
 def _rendered(
     avatar: HandAvatar,
     frames: list[Frame],
     poses: list[HandPose],
     report: Callable[[float], None],
 ) -> _Protocol:
-    renderings = []
-    for number, (frame, pose) in enumerate(zip(frames, poses, strict=True)):
-        report(number / len(frames))
-        renderings.append(_on_cpu(avatar.render(pose, frame.camera)))
+    renderings: list[Rendering] = []
+    for start in range(0, len(frames), _AT_ONCE):
+        report(start / len(frames))
+        part = slice(start, start + _AT_ONCE)
+        cameras = [frame.camera for frame in frames[part]]
+        renderings += map(_on_cpu, avatar.render_batch(poses[part], cameras))
     judged = [
         judged_frame(frame, rendering.color, rendering.alpha)
         for frame, rendering in zip(frames, renderings, strict=True)
@@ -170,7 +182,7 @@ def _rendered(
 
 
 _FITTED_SIZE = 256
-"""Pixels along a side of the pictures that hands are laid onto."""
+"""Pixels along a side of the pictures that hands are laid onto, and that are judged."""
 
 
 def held_out_poses(avatar: HandAvatar, frames: list[Frame]) -> list[HandPose]:
@@ -240,6 +252,12 @@ def _measured(
         notes.append("truth: null, the capture knows neither albedo nor shading of these frames")
     color = training_color(capture)
     colors = [] if color is None else [(color * frame.gain).clamp(0, 1) for frame in frames]
+    stored = capture.records[0].camera.width
+    if frames[0].camera.width != stored:
+        notes.append(
+            f"judged at {frames[0].camera.width} pixels along a side, of {stored} that the capture "
+            "stores; --full-size judges these"
+        )
     times = torch.tensor([frame.time for frame in frames], dtype=torch.float64)
     figures = {
         key: protocol_figures(protocol.judged, times, colors) for key, protocol in protocols.items()
@@ -363,7 +381,7 @@ def _against_truth(
         files = [capture.folder / "truth" / kind / f"{frame.name}.png" for kind in _TRUTH]
         if not all(file.is_file() for file in files):
             return None
-        albedo, shading = (float_image(file) for file in files)
+        albedo, shading = (_binned(float_image(file), len(frame.mask)) for file in files)
         mask = frame.mask & (rendering.alpha > 0.5)
         albedos.append(rendering.albedo / rendering.alpha.clamp_min(1e-6)[..., None])
         lights.append(rendering.illumination / rendering.alpha.clamp_min(1e-6))
@@ -374,6 +392,14 @@ def _against_truth(
         "albedo_psnr": albedo_psnr(albedos, true_albedos, masks),
         "shading_correlation": shading_correlation(lights, shadings, masks),
     }
+
+
+def _binned(image: Tensor, side: int) -> Tensor:
+    """A picture as :meth:`Frame.binned` leaves it, of so many rows."""
+    factor = len(image) // side
+    if factor == 1:
+        return image
+    return image.unflatten(0, (-1, factor)).unflatten(2, (-1, factor)).mean((1, 3))
 
 
 _TRUTH = ("albedo", "shading")
