@@ -899,7 +899,9 @@ class HandAvatar(nn.Module):
         elif self.texture is None or self.texture.texels.shape != texels.shape:
             self.give_texture(len(texels))
         seen_frames = state.get("seen_frames")
-        self.seen_frames = None if seen_frames is None else torch.zeros_like(seen_frames)
+        self.seen_frames = (
+            None if seen_frames is None else torch.zeros_like(seen_frames, device=self.device)
+        )
         self.load_state_dict(state)
         self.edit = _stored_edit(about["edit"], tensors)
 

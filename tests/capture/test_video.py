@@ -29,7 +29,13 @@ from handavatar.capture.video import (
     stored_size,
     summary_lines,
 )
-from handavatar.capture.windows import Window
+from handavatar.capture.windows import (
+    FINE_SIDE,
+    MASK_SIDE,
+    Window,
+    resampled,
+    window_around,
+)
 from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.geometry.cameras import project
 from handavatar.hand.open_hand import load_open_hand
@@ -151,6 +157,31 @@ def test_pictures_are_stored_as_large_as_the_video_shows_the_hand(
         # A pixel of 512 is less than two of the fine stripes wide: some are nearly black.
         assert 40 < float(colors.mean()) < 110
     assert float((colors.mean(-1) < 20).float().mean()) > 0.1
+
+
+@pytest.mark.parametrize("is_mirrored", [False, True])
+def test_picture_and_mask_are_cut_from_the_same_square(is_mirrored: bool) -> None:
+    """Of a hand of which the mask's window has fewer pixels than the video."""
+    y, x = np.mgrid[:1000, :1400]
+    image = np.stack([x / 6, y / 5, 120 + 60 * np.sin(x / 9) * np.sin(y / 11)], axis=-1)
+    image = image.astype(np.uint8)
+    landmarks = np.random.default_rng(0).uniform((480.0, 300.0), (820.0, 700.0), (21, 2))
+    windows = [window_around(image, landmarks, side) for side in (MASK_SIDE, FINE_SIDE)]
+    hand = replace(made_hand(0)[0], window=windows[0], fine=windows[1], landmarks=landmarks)
+    hand = hand.mirrored() if is_mirrored else hand
+    assert hand.window.scale < 0.7 < 1 == pytest.approx(hand.stored_from.scale, abs=0.01)
+    box = video_module._Box((420.5, 260.25), 500.0)
+    direct = image[:, ::-1] if is_mirrored else image
+    cuts = []
+    for window in (hand.window, hand.stored_from):
+        corner, side = box.seen_in(window)
+        zoom = np.eye(2) * (side / 128)
+        cuts.append(resampled(window.image, zoom, np.array(corner), 128).astype(float))
+    cuts.append(resampled(direct, np.eye(2) * (500 / 128), np.array(box.corner), 128).astype(float))
+    for cut in cuts[:2]:
+        # A pixel beside would be three steps in the first two channels.
+        assert np.abs(cut - cuts[2])[8:-8, 8:-8, :2].mean() < 0.7
+        assert abs((cut - cuts[2])[8:-8, 8:-8, :2].mean()) < 0.5
 
 
 _MADE = 9

@@ -356,16 +356,32 @@ def test_a_run_folder_names_its_capture_and_shows_its_curves(
 def test_large_pictures_are_judged_binned_unless_asked_for_whole(
     avatar_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run_module, "_FITTED_SIZE", 48)
+    monkeypatch.setattr(run_module, "FITTED_SIDE", 48)
     folder = write_tiny_capture(tmp_path / "large", "aab", size=96)
+    capture = read_capture(folder)
+    mask = capture.frame(2).mask.numpy()[..., None]
     for kind in ("albedo", "shading"):
         (folder / "truth" / kind).mkdir(parents=True)
-        pixels = np.full((96, 96, 3), 128, dtype=np.uint8)
+        pixels = np.where(mask, 128, 0).astype(np.uint8).repeat(3, -1)
         Image.fromarray(pixels).save(folder / "truth" / kind / "000002.png")
+    # What is black beside the hand darkens no pixel of its outline.
+    small = capture.frame(2).binned(48)
+    truth = run_module.true_picture(capture, small, "albedo")
+    assert truth.shape == (48, 48, 3)
+    assert torch.allclose(truth[small.mask], torch.tensor(128 / 255))
+    avatar = HandAvatar.load(avatar_file)
+    avatar.seen_frames = torch.zeros(256, dtype=torch.int32)
+    avatar.seen_frames[:64] = 1
+    avatar.save(tmp_path / "avatar.safetensors")
     for full_size, side in ((False, 48), (True, 96)):
         out = tmp_path / f"out{side}"
-        options = EvaluateOptions(avatar_file, folder, out=out, full_size=full_size, device="cpu")
+        options = EvaluateOptions(
+            tmp_path / "avatar.safetensors", folder, out=out, full_size=full_size, device="cpu"
+        )
         metrics = evaluate_run(options)
+        # What nobody has seen is told as well, in figures and in the report.
+        assert metrics["skin_never_seen"]["share"] == 0.75 and metrics["skin_never_seen"]["regions"]
+        assert "Skin that was never seen" in (out / "report.html").read_text()
         with Image.open(out / "000002.png") as strip:
             assert strip.height == side
         notes = [note for note in metrics["notes"] if "--full-size" in note]

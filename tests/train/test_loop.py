@@ -486,5 +486,13 @@ def test_large_pictures_are_binned_for_all_but_the_detail(
 
         monkeypatch.setattr(loop, name, spied)
     avatar = HandAvatar.load(train(_options(folder, tmp_path / "run", steps=4)))
+    # Of very many frames some stay binned.
+    monkeypatch.setattr(loop, "_DETAILED_FRAMES", 1)
+    some = loop._detailed_frames(
+        read_capture(write_tiny_capture(tmp_path / "many", "aab", size=96)),
+        [capture.frame(0).binned(48)] * 2,
+    )
+    assert [frame.camera.width for frame in some] == [96, 48]
     assert widths == {"find_seen_samples": {48}, "learn_detail": {96}}
+    assert avatar.seen_frames is not None and avatar.seen_frames.unique().tolist() == [0, 1]
     assert avatar.texture is not None and bool(avatar.texture.texels.any())

@@ -3,6 +3,7 @@
 import copy
 from pathlib import Path
 
+import numpy as np
 import torch
 from conftest import lit_frame
 
@@ -56,6 +57,17 @@ def test_figures_name_the_palm_of_a_hand_seen_from_above(small_avatar: HandAvata
     assert "palm" in figures["regions"] and "back" not in figures["regions"]
     assert set(figures["regions"]) <= set(skin_regions(avatar.rig))
     assert unseen_figures(small_avatar) is None
+
+
+def test_a_left_hand_is_shown_as_the_mirror_image(small_avatar: HandAvatar) -> None:
+    avatar = _seen_from_above(small_avatar)
+    right = unseen_pictures(avatar, 48)
+    avatar.info = {**avatar.info, "side": "left"}
+    left = unseen_pictures(avatar, 48)
+    pairs = [(0, 0), (1, 3), (2, 2), (3, 1)]  # what is right of one is left of the other
+    for mine, other in pairs:
+        mirrored = left[VIEWS[mine]][:, ::-1].astype(int)
+        assert np.abs(mirrored - right[VIEWS[other]]).mean() < 3
 
 
 def test_pictures_from_all_sides_have_the_tint_where_nobody_saw(small_avatar: HandAvatar) -> None:

@@ -61,6 +61,9 @@ Said = TypeVar("Said")
 SCHEMA = 1
 SPLITS = ("train", "val", "test")
 MAX_FRAMES = 100_000
+FITTED_SIDE = 256
+"""Pixels along a side of the pictures that hands are laid onto, learned from and judged; larger
+ones are binned towards it (:meth:`Frame.binned`)."""
 _UNKNOWN_GREY = 128
 COVARIANCES = "covariances.safetensors"
 """File of a capture: tensor ``covariance``, one matrix per frame, in the order of the frames."""
@@ -171,15 +174,18 @@ class Frame:
     def binned(self, side: int) -> "Frame":
         """The same frame with square blocks of pixels averaged, as large ones as leave it ``side``.
 
-        A block is known if all of it is. A picture that is not twice as large, or whose sides are
-        no multiple of such blocks, stays as it is.
+        A block is known if all of it is. Both sides are multiples of the block's; a picture that
+        is not twice as large, or is no multiple of any block, stays as it is.
 
         Args:
             side: pixels that the longer side keeps at least.
         """
         width, height = self.camera.width, self.camera.height
-        factor = max(1, max(width, height) // side)
-        if factor == 1 or width % factor or height % factor:
+        largest = max(1, max(width, height) // side)
+        factor = next(
+            factor for factor in range(largest, 0, -1) if width % factor == height % factor == 0
+        )
+        if factor == 1:
             return self
 
         def means(values: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from handavatar.capture.fitted_hand import HandFit
 from handavatar.capture.fitting import Observations
-from handavatar.capture.frames import Capture, Frame
+from handavatar.capture.frames import FITTED_SIDE, Capture, Frame
 from handavatar.capture.masks import HandMask, mask_coverage
 from handavatar.capture.tracking import TrackedHand
 from handavatar.capture.windows import window_camera
@@ -221,7 +221,8 @@ def poses_of(found: Registered) -> list[HandPose]:
 
 
 def observe_frame(frame: Frame) -> Observation:
-    """What a frame of a capture shows."""
+    """What a frame of a capture shows, its picture binned if it is large."""
+    frame = frame.binned(FITTED_SIDE)
     picture = FramePicture.of(
         frame.camera, frame.image.float() / 255, frame.alpha, frame.known, frame.gain
     )

@@ -17,7 +17,7 @@ from PIL import Image
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import VideoFrame
-from handavatar.capture.windows import FINE_SIDE, Window, resampled, window_around
+from handavatar.capture.windows import FINE_SIDE, MASK_SIDE, Window, resampled, window_around
 
 NUM_LANDMARKS = 21
 LANDMARK_NAMES: tuple[str, ...] = (
@@ -71,8 +71,7 @@ class TrackedHand:
         spread: disagreement of the looks per landmark, pixels.
         world_landmarks: metres about the hand's centre, camera axes.
         presence: the tracker's certainty, in [0, 1].
-        fine: the same surroundings with up to twice the pixels, from which the picture is stored;
-            the window itself if it is left out.
+        fine: the same surroundings with up to twice the pixels; None where the video has no more.
     """
 
     index: int
@@ -82,12 +81,12 @@ class TrackedHand:
     spread: Float[np.ndarray, "21"]
     world_landmarks: Float[np.ndarray, "21 3"]
     presence: float
-    fine: Window = None  # type: ignore[assignment]
+    fine: Window | None = None
 
-    def __post_init__(self) -> None:
-        """The window is as fine as any where the picture has no more pixels."""
-        if self.fine is None:
-            object.__setattr__(self, "fine", self.window)
+    @property
+    def stored_from(self) -> Window:
+        """The surroundings from which the picture is stored."""
+        return self.fine or self.window
 
     def mirrored(self) -> "TrackedHand":
         """The same hand in the mirrored picture."""
@@ -96,7 +95,7 @@ class TrackedHand:
         return replace(
             self,
             window=self.window.mirrored(),
-            fine=self.fine.mirrored(),
+            fine=None if self.fine is None else self.fine.mirrored(),
             landmarks=self.landmarks * flip + shift,
             world_landmarks=self.world_landmarks * np.array([-1.0, 1.0, 1.0]),
         )
@@ -330,11 +329,12 @@ def _combined(finder: HandFinder, frame: VideoFrame, first: Sighting) -> Tracked
     unsure = 0.1 * size if len(looks) == 1 else 0.0
     spread = np.linalg.norm(landmarks - middle, axis=-1).max(0) + unsure
     window = window_around(frame.image, middle)
+    is_whole = len(window.image) < MASK_SIDE
     return TrackedHand(
         index=frame.index,
         time=frame.time,
         window=window,
-        fine=window if window.scale >= 1 else window_around(frame.image, middle, FINE_SIDE),
+        fine=None if is_whole else window_around(frame.image, middle, FINE_SIDE),
         landmarks=middle,
         spread=spread,
         world_landmarks=np.median(np.stack([look.world_landmarks for look in looks]), axis=0),

@@ -81,7 +81,7 @@ Progress = Callable[[float, str], None]
 
 _BOX_SCALE = 1.3
 _SIZES = (256, 512)
-# Pixels along a side at which the fitted mesh is compared with its mask.
+# Pixels along a side at which the fitted mesh is compared with its mask, at least.
 _MESH_SIDE = 768
 _WRIST_MARGIN = 0.008
 """Metres before the rig's end from where on masks are believed."""
@@ -217,7 +217,7 @@ class FittedFrame:
         frame: cropped picture, cut mask, camera, pose; its split is set when it is written.
         mesh: pixels that the fitted hand covers.
         mask_iou: agreement of mask and mesh in front of the wrist, intersection over union.
-        landmark_error: mean distance of fitted and tracked landmarks, pixels of the crop.
+        landmark_error: mean distance of fitted and tracked landmarks, pixels of a crop of 256.
         mask_quality: how far the mask's border follows edges of the picture, in [0, 1].
         outside_share: of the fitted mesh, beyond the camera's picture.
         unknown_share: of the fitted mesh, in the picture but hidden or not told apart.
@@ -538,9 +538,9 @@ def _result(
     fit, vertices = fitted.fit, fitted.vertices[number]
     rim = rig.rim.numpy()
     camera = window_camera(fit.focal, window.picture_size, box.corner, box.side, size)
-    fine_corner, fine_side = box.seen_in(hand.fine)
+    fine_corner, fine_side = box.seen_in(hand.stored_from)
     image = resampled(
-        hand.fine.image, np.eye(2) * (fine_side / size), np.array(fine_corner), size
+        hand.stored_from.image, np.eye(2) * (fine_side / size), np.array(fine_corner), size
     ).copy()
     corner, side = box.seen_in(window)
     zoom = np.eye(2) * (side / size)
@@ -549,7 +549,7 @@ def _result(
     was_seen = _is_in_view(window, corner, side, size)
     image[~was_seen] = 128
 
-    samples = max(1, _MESH_SIDE // size)
+    samples = -(-_MESH_SIDE // size)
     fine_camera = camera.resized(samples * size, samples * size)
     mesh = covered_shares(silhouette(rig, vertices, fine_camera), samples)
     in_crop = project(camera, vertices)[0].double().numpy()
@@ -582,7 +582,14 @@ def _result(
     pixels = float(np.ptp(hand.landmarks, axis=0).max())
     reason = _reason(pixels, outside, unknown, guided, factors, iou, error, options.min_confidence)
     return FittedFrame(
-        frame, mesh > 0.5, iou, error * scale, guided.edge_quality, outside, unknown, reason
+        frame,
+        mesh > 0.5,
+        iou,
+        error * scale * 256 / size,
+        guided.edge_quality,
+        outside,
+        unknown,
+        reason,
     )
 
 

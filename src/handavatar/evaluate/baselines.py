@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar
-from handavatar.capture.frames import Capture, Frame
+from handavatar.capture.frames import FITTED_SIDE, Capture, Frame
 from handavatar.evaluate.metrics import JudgedFrame, exposed, masked_psnr, mean_color
 from handavatar.evaluate.textured_mesh import fit_textured_mesh
 from handavatar.hand.pose import HandPose
@@ -19,12 +19,12 @@ MESH_FRAMES, MESH_STEPS = 30, 300
 
 def training_color(capture: Capture) -> Float[Tensor, "3"] | None:
     """Mean colour of the training frames' hand pixels, without their gain; None without frames."""
-    frames = [capture.frame(index) for index in capture.split("train")]
+    frames = [capture.frame(index).binned(FITTED_SIDE) for index in capture.split("train")]
     frames = [frame for frame in frames if bool(frame.mask.any())]
     if not frames:
         return None
     return mean_color(
-        [frame.image.float() / 255 / frame.gain for frame in frames],
+        [frame.colors for frame in frames],
         [frame.mask for frame in frames],
     )
 
@@ -53,9 +53,9 @@ def textured_mesh_psnr(
     indices = capture.split("train")
     count = min(MESH_FRAMES, len(indices))
     places = torch.linspace(0, len(indices) - 1, count).round().long().tolist()
-    training = [capture.frame(indices[place]) for place in places]
-    if frames:  # As large as what is judged.
-        training = [frame.binned(frames[0].camera.width) for frame in training]
+    # As large as what is judged.
+    side = max(frames[0].camera.width, frames[0].camera.height)
+    training = [capture.frame(indices[place]).binned(side) for place in places]
     found = zip(training, poses_of(training), strict=True)
     training = [replace(frame, pose=pose) for frame, pose in found]
     picture_of = fit_textured_mesh(avatar, training, color, MESH_STEPS, seed=0, rays=1)

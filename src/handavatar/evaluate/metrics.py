@@ -178,7 +178,7 @@ class JudgedFrame:
         return quantised(rendered), quantised(truth)
 
     def region(self) -> Bool[Tensor, "height width"]:
-        """The known pixels of the union of both masks, dilated by ``REGION_MARGIN``.
+        """The known pixels of the union of both masks and ``REGION_MARGIN`` around it.
 
         Raises:
             ValueError: if neither picture shows a hand.
@@ -254,7 +254,7 @@ def paper_scores(frames: Sequence[JudgedFrame]) -> PaperScores:
 
 
 def masked_scores(frames: Sequence[JudgedFrame]) -> MaskedScores:
-    """Protocol ``masked``: the hand and ``REGION_MARGIN`` pixels around it."""
+    """Protocol ``masked``: the hand and ``REGION_MARGIN`` around it."""
     ratios = [masked_psnr(frame) for frame in frames]
     return MaskedScores(
         psnr=_mean(ratios),

@@ -34,16 +34,18 @@ def registered_pose(
         avatar: stays as it is.
         frame: the picture, and what of it is known; its own pose is not asked.
         pose: to start from.
-        rendering: of the avatar in this pose, from the frame's camera; made if None.
+        rendering: of the avatar in this pose, from the frame's camera; made if None, or if it is
+            larger than pictures are compared.
     """
-    if rendering is None:
-        rendering = avatar.render(pose, frame.camera)
+    seen = observe_frame(frame)
+    if rendering is None or rendering.alpha.shape != seen.picture.known.shape:
+        rendering = avatar.render(pose, seen.picture.camera)
     start = pose.to("cpu")
     shown = FramePicture.of(
-        frame.camera,
+        seen.picture.camera,
         rendering.color.cpu(),
         rendering.alpha.cpu(),
-        torch.ones_like(frame.known),
+        torch.ones_like(seen.picture.known),
         torch.ones(3),
     )
     view = frame.camera.camera_from_world[:3, :3].cpu()
@@ -53,7 +55,7 @@ def registered_pose(
     options = RegisterOptions(energy=EnergyOptions(texture_share=VIDEO_TEXTURE_SHARE))
     followed = follow_picture(
         fitted_hand(avatar, pose),
-        observe_frame(frame),
+        seen,
         shown,
         start,
         information,

@@ -14,7 +14,14 @@ from torch import Tensor
 
 from handavatar.animate import VideoWriter
 from handavatar.avatar import HandAvatar, Rendering, chosen_device
-from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
+from handavatar.capture.frames import (
+    FITTED_SIDE,
+    Capture,
+    CaptureError,
+    Frame,
+    FrameRecord,
+    read_capture,
+)
 from handavatar.capture.registration import poses_of as registered_poses
 from handavatar.capture.registration import register_frames
 from handavatar.evaluate.baselines import judged_frame, textured_mesh_psnr, training_color
@@ -66,9 +73,8 @@ class EvaluateOptions:
         out: folder for pictures, ``metrics.json`` and ``report.html``; by default
             ``evaluation`` in the run.
         max_frames: judge at most so many frames, evenly spread over the split.
-        full_size: judge pictures as large as the capture stores them; otherwise those that are
-            twice as large or larger are binned to 256 pixels along a side, so that figures
-            compare, and four times as soon.
+        full_size: judge pictures as large as the capture stores them; otherwise large ones are
+            binned towards 256 pixels along a side, so that figures compare, and sooner.
         device: where the fields run.
     """
 
@@ -126,7 +132,7 @@ def evaluate_run(
     claim_folder(out, EVALUATION)
     frames = [capture.frame(index) for index in indices]
     if not options.full_size:
-        frames = [frame.binned(_FITTED_SIZE) for frame in frames]
+        frames = [frame.binned(FITTED_SIDE) for frame in frames]
     report = progress or (lambda share, doing: None)
     protocols = _protocols(avatar, frames, capture.is_tracked, report)
     report(0.9, "measuring")
@@ -181,17 +187,12 @@ def _rendered(
     return _Protocol(poses, renderings, judged)
 
 
-_FITTED_SIZE = 256
-"""Pixels along a side of the pictures that hands are laid onto, and that are judged."""
-
-
 def held_out_poses(avatar: HandAvatar, frames: list[Frame]) -> list[HandPose]:
     """Poses by landmarks and masks alone, never by colours.
 
     Training corrects the poses of its own frames; held-out frames get the same chance, with the
-    avatar's shape as it is, and pictures as large as training takes them.
+    avatar's shape as it is.
     """
-    frames = [frame.binned(_FITTED_SIZE) for frame in frames]
     hands = [fitted_hand(avatar, frame.pose) for frame in frames]
     options = RegisterOptions(
         pose_error=float(avatar.info.get("pose_error", RegisterOptions.pose_error)),
@@ -252,7 +253,7 @@ def _measured(
         notes.append("truth: null, the capture knows neither albedo nor shading of these frames")
     color = training_color(capture)
     colors = [] if color is None else [(color * frame.gain).clamp(0, 1) for frame in frames]
-    stored = capture.records[0].camera.width
+    stored = _record_of(capture, frames[0]).camera.width
     if frames[0].camera.width != stored:
         notes.append(
             f"judged at {frames[0].camera.width} pixels along a side, of {stored} that the capture "
@@ -381,7 +382,7 @@ def _against_truth(
         files = [capture.folder / "truth" / kind / f"{frame.name}.png" for kind in _TRUTH]
         if not all(file.is_file() for file in files):
             return None
-        albedo, shading = (_binned(float_image(file), len(frame.mask)) for file in files)
+        albedo, shading = (true_picture(capture, frame, kind) for kind in _TRUTH)
         mask = frame.mask & (rendering.alpha > 0.5)
         albedos.append(rendering.albedo / rendering.alpha.clamp_min(1e-6)[..., None])
         lights.append(rendering.illumination / rendering.alpha.clamp_min(1e-6))
@@ -394,12 +395,28 @@ def _against_truth(
     }
 
 
-def _binned(image: Tensor, side: int) -> Tensor:
-    """A picture as :meth:`Frame.binned` leaves it, of so many rows."""
-    factor = len(image) // side
+def true_picture(capture: Capture, frame: Frame, kind: str) -> Tensor:
+    """What a made capture knows of a frame's pixels, binned as the frame is.
+
+    Args:
+        capture: whose ``truth`` it is; its files are black outside of the stored mask.
+        frame: of it.
+        kind: a folder of ``truth``, such as ``albedo``.
+    """
+    image = float_image(capture.folder / "truth" / kind / f"{frame.name}.png")
+    factor = len(image) // len(frame.mask)
     if factor == 1:
         return image
-    return image.unflatten(0, (-1, factor)).unflatten(2, (-1, factor)).mean((1, 3))
+    mask = float_image(capture.folder / _record_of(capture, frame).mask_path) > 0.5
+    image = image if image.ndim > 2 else image[..., None]
+    values = torch.cat([image * mask[..., None], mask[..., None].float()], dim=-1)
+    means = values.unflatten(0, (-1, factor)).unflatten(2, (-1, factor)).mean((1, 3))
+    found = means[..., :-1] / means[..., -1:].clamp_min(1e-6)
+    return found if found.shape[-1] > 1 else found[..., 0]
+
+
+def _record_of(capture: Capture, frame: Frame) -> FrameRecord:
+    return next(record for record in capture.records if record.name == frame.name)
 
 
 _TRUTH = ("albedo", "shading")

@@ -20,7 +20,7 @@ from PIL import Image
 from torch import Tensor, nn
 
 from handavatar.avatar import START_LIGHT, HandAvatar, HandState, RenderSettings
-from handavatar.capture.frames import Capture, Frame, read_capture
+from handavatar.capture.frames import FITTED_SIDE, Capture, Frame, read_capture
 from handavatar.capture.synthetic import crop_camera
 from handavatar.evaluate.baselines import judged_frame
 from handavatar.evaluate.metrics import (
@@ -34,7 +34,7 @@ from handavatar.evaluate.metrics import (
     shading_correlation,
 )
 from handavatar.evaluate.perceptual import PerceptualLoss, perceptual_loss
-from handavatar.evaluate.run import float_image, held_out_poses
+from handavatar.evaluate.run import held_out_poses, true_picture
 from handavatar.field.anchors import Neighbours
 from handavatar.field.layers import MLP
 from handavatar.field.shading import (
@@ -308,7 +308,8 @@ def fitted_geometry(capture: Capture, shape: Shape, method: Method, seed: int) -
     settings = RenderSettings(num_samples=method.num_samples)
     seen = find_seen_samples(avatar, frames, settings, method.warm_stride)
     seen = place_directions(avatar, frames, seen, seed)
-    tests = _aligned(avatar, [capture.frame(index) for index in capture.split("test")])
+    tests = [capture.frame(index).binned(FITTED_SIDE) for index in capture.split("test")]
+    tests = _aligned(avatar, tests)
     views = [view_of_frame(avatar, frame, frame.camera, settings) for frame in tests]
     chosen = torch.linspace(0, len(tests) - 1, _TURNED_POSES).round().long().tolist()
     return FittedGeometry(
@@ -516,8 +517,8 @@ def judged(
         lights.append(picture["light"] / alpha)
         masks.append(frame.mask & pair.rendered_mask)
         if is_split_known:
-            true_albedos.append(_truth(capture, "albedo", frame.name))
-            shadings.append(_truth(capture, "shading", frame.name))
+            true_albedos.append(true_picture(capture, frame, "albedo"))
+            shadings.append(true_picture(capture, frame, "shading"))
     whole = {}
     if is_split_known:
         whole["albedo"] = albedo_psnr(albedos, true_albedos, masks)
@@ -554,7 +555,7 @@ def _true_column(capture: Capture, frames: list[Frame]) -> Float[Tensor, "height
         color = frame.shown.float() / 255 * frame.alpha[..., None]
         shading = torch.zeros_like(color)
         if knows_split(capture):
-            shading = _truth(capture, "shading", frame.name)[..., None].expand(-1, -1, 3)
+            shading = true_picture(capture, frame, "shading")[..., None].expand(-1, -1, 3)
         parts += [color, shading]
     return torch.cat(parts)
 
@@ -588,10 +589,6 @@ class FrameScores:
         self.by_name[self._distance.name].append(float(self._distance(rendered[None], truth[None])))
         self.by_name["psnr_paper"].append(paper_scores([pair]).psnr)
         return pair
-
-
-def _truth(capture: Capture, kind: str, name: str) -> Tensor:
-    return float_image(capture.folder / "truth" / kind / f"{name}.png")
 
 
 def ablate(

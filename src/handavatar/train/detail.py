@@ -113,7 +113,7 @@ def find_detail_views(
     Args:
         avatar: with a texture, which plays no part.
         frames: of training, their poses as training sees them.
-        seen: pixels of the same frames.
+        seen: pixels of the same frames, of pictures of any size.
     """
     vertices = avatar.rig.template_vertices
     near = nearest_anchors(avatar.anchors.positions(vertices), vertices)
@@ -219,7 +219,7 @@ def learn_detail(
     Args:
         avatar: whose appearance is learned; a texture that it has is replaced.
         frames: of training, their poses as training sees them.
-        seen: pixels of the same frames.
+        seen: pixels of the same frames, of pictures of any size.
         size: texels along a side.
         steps: on patches; 0 leaves what was unwrapped.
         perceptual: beside the colour loss and SSIM.

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar, RenderSettings, chosen_device
-from handavatar.capture.frames import Capture, CaptureError, Frame, read_capture
+from handavatar.capture.frames import FITTED_SIDE, Capture, CaptureError, Frame, read_capture
 from handavatar.capture.view import view_of
 from handavatar.evaluate.metrics import mean_color
 from handavatar.evaluate.perceptual import PerceptualChoice, PerceptualLoss, perceptual_loss
@@ -110,8 +110,8 @@ class Method:
         decay: all learning rates fall by this factor until the end, exponentially.
         occupancy_points: labelled points per frame for L_PairOF.
         occupancy_every: L_PairOF is taken at every so many steps.
-        picture_size: pixels along a side from which all but the detail is learned; larger pictures
-            are made smaller for it. None takes them as they are.
+        picture_size: pixels along a side towards which pictures are binned for all but the detail;
+            None takes them as they are.
         rounds: midpoint subdivisions of the rig's mesh.
         num_anchors: anchors on the surface.
         detail_size: texels along a side of the texture that is learned last (``train.detail``); 0
@@ -147,13 +147,15 @@ class Method:
     decay: float = 0.1
     occupancy_points: int = 1024
     occupancy_every: int = 1
-    picture_size: int | None = 256
+    picture_size: int | None = FITTED_SIDE
     rounds: int = 2
     num_anchors: int = 4096
     detail_size: int = 0
     detail_steps: int = 0
 
 
+_DETAILED_FRAMES = 256
+"""So many frames, evenly spread, give the detail their large pictures: about 7 MB each."""
 _DETAIL_STRIDE = 4
 """Where no pixels were found before, every so-manieth tells the detail of the light."""
 
@@ -350,10 +352,7 @@ def _learn_detail(
         settings = RenderSettings(num_samples=method.num_samples)
         small = corrected_frames(training, frames)
         seen = find_seen_samples(avatar, small, settings, _DETAIL_STRIDE)
-    # Here the pictures count as large as they are.
-    corrected = corrected_frames(
-        training, training_frames(capture, replace(method, picture_size=None))
-    )
+    corrected = corrected_frames(training, _detailed_frames(capture, frames))
 
     def end_if_stopped() -> None:
         if stopped():
@@ -376,6 +375,26 @@ def _learn_detail(
         "perceptual": perceptual.name,
         "seen_share": round(learned.seen_share, 4),
     }
+
+
+def _detailed_frames(capture: Capture, frames: list[Frame]) -> list[Frame]:
+    """The training frames as the capture stores them; of very many, some stay binned.
+
+    Args:
+        capture: of the frames.
+        frames: as large as training takes them.
+    """
+    indices = capture.split("train")
+    places = torch.linspace(0, len(frames) - 1, min(len(frames), _DETAILED_FRAMES))
+    whole = set(places.round().long().tolist())
+
+    def is_stored(number: int) -> bool:
+        return capture.records[indices[number]].camera == frames[number].camera
+
+    return [
+        frame if number not in whole or is_stored(number) else capture.frame(indices[number])
+        for number, frame in enumerate(frames)
+    ]
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from handavatar.render.rasterize import rasterize
 _FIT_SCALE = 1.5
 """Pixels (of 256) of a frame's fit error that leave it a weight of exp(-1)."""
 _SAME_DEPTH = 4e-3
-"""Metres that a texel may lie behind the nearest surface within a pixel around it."""
+"""Metres that a texel may lie behind the nearest surface within a pixel (of 256) around it."""
 _LARGEST_SHIFT = 3.0
 """Pixels (of 256) between a point of the mesh and where the picture shows it, at most."""
 _LEAST_COSINE = 0.1
@@ -176,8 +176,11 @@ def _seen_faces(
     area = (along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]).abs() / 2
     weights = cosine**4 * area / uv_areas.clamp_min(1e-12)
     depth = rasterize(view.vertices, faces, view.camera).depth
-    # The nearest within a pixel around: what is half hidden is not seen.
-    nearest = -max_pool2d(-depth[None, None].clamp_max(1e6), 3, stride=1, padding=1)[0, 0]
+    # The nearest within a pixel (of 256) around: what is half hidden is not seen.
+    reach = max(1, round(view.pixel))
+    nearest = -max_pool2d(
+        -depth[None, None].clamp_max(1e6), 2 * reach + 1, stride=1, padding=reach
+    )[0, 0]
     weights = torch.where((cosine > _LEAST_COSINE) & ~is_flat, weights, 0.0)
     return _Seen(weights, per_uv, nearest + _SAME_DEPTH)
 
