@@ -109,8 +109,8 @@ def test_turning_the_world_changes_nothing(avatar: HandAvatar) -> None:
     expected = hand.posed(found).vertices @ world[:3, :3].T
     apart = (hand.posed(again).vertices - expected).detach().norm(dim=-1)
     assert distance(avatar, start, found) > 1e-3
-    # With errors along the world's axes, 0.27 mm.
-    assert float(apart.mean()) < 1.8e-4
+    # With errors along the world's axes, 3.1 mm; steps that end early leave 0.2.
+    assert float(apart.mean()) < 4e-4
 
 
 def test_landmarks_of_the_frame_are_not_asked(avatar: HandAvatar) -> None:

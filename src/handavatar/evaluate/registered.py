@@ -11,7 +11,7 @@ import torch
 from handavatar.avatar import HandAvatar, Rendering
 from handavatar.capture.frames import Frame
 from handavatar.capture.registration import observe_frame
-from handavatar.fit.energy import VIDEO_TEXTURE_SHARE, EnergyOptions
+from handavatar.fit.energy import EnergyOptions
 from handavatar.fit.kinematics import NUM_UNKNOWNS
 from handavatar.fit.pictures import FramePicture
 from handavatar.fit.register import RegisterOptions, follow_picture
@@ -19,9 +19,13 @@ from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import ShapedHand
 
 # Expected errors of the pose to start from: radians of a joint about each axis; metres
-# across and along the line of sight.
+# across and along the line of sight. Half a pixel by which outlines of avatar and picture differ
+# all around would move the hand by centimetres along it: it stays where outlines have put it.
 _ROTATION_ERROR = math.radians(3) / 3**0.5
-_TRANSLATION_ERROR = (0.003, 0.003, 0.006)
+_TRANSLATION_ERROR = (0.003, 0.003, 0.0005)
+# Of independent observations in each blurred pixel. With more, the texture draws hands off their
+# outlines; on made frames, whose poses are known, this is the best of 0.1, 0.5 and 2.
+_TEXTURE_SHARE = 0.5
 
 
 @torch.no_grad()
@@ -51,8 +55,7 @@ def registered_pose(
     view = frame.camera.camera_from_world[:3, :3].cpu()
     information = torch.eye(NUM_UNKNOWNS) / _ROTATION_ERROR**2
     information[-3:, -3:] = view.T @ torch.diag(torch.tensor(_TRANSLATION_ERROR) ** -2) @ view
-    # As of a video: what the hand looks like is known, and not learned from poses that are off.
-    options = RegisterOptions(energy=EnergyOptions(texture_share=VIDEO_TEXTURE_SHARE))
+    options = RegisterOptions(energy=EnergyOptions(texture_share=_TEXTURE_SHARE))
     followed = follow_picture(
         fitted_hand(avatar, pose),
         seen,
