@@ -187,18 +187,24 @@ class Frame:
         )
         if factor == 1:
             return self
-
-        def means(values: Tensor) -> Tensor:
-            blocks = values.unflatten(0, (-1, factor)).unflatten(2, (-1, factor))
-            return blocks.float().mean((1, 3))
-
         return replace(
             self,
-            image=means(self.image).round().to(torch.uint8),
-            coverage=means(self.coverage).round().to(torch.uint8),
+            image=block_means(self.image, factor).round().to(torch.uint8),
+            coverage=block_means(self.coverage, factor).round().to(torch.uint8),
             camera=self.camera.resized(width // factor, height // factor),
-            known=means(self.known) == 1,
+            known=block_means(self.known, factor) == 1,
         )
+
+
+def block_means(values: Tensor, factor: int) -> Tensor:
+    """Means over square blocks of pixels, as floats; further axes stay.
+
+    Args:
+        values: height, width, and any further axes.
+        factor: pixels along a side of a block; divides height and width.
+    """
+    blocks = values.unflatten(0, (-1, factor)).unflatten(2, (-1, factor))
+    return blocks.float().mean((1, 3))
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,6 +28,7 @@ from handavatar.capture.fitting import (
 from handavatar.capture.frames import SPLITS, Capture, CaptureWriter, Frame, read_capture
 from handavatar.capture.guided_masks import (
     GuidedMask,
+    WristLine,
     cut_at_wrist,
     find_guided_mask,
     is_cut_unsure,
@@ -68,7 +69,7 @@ from handavatar.capture.windows import Window, resampled, window_camera
 from handavatar.fit.energy import VIDEO_TEXTURE_SHARE, EnergyOptions
 from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.fit.register import RegisterOptions
-from handavatar.geometry.cameras import project
+from handavatar.geometry.cameras import Camera, project
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import FolderKind, files_named, mark_folder
@@ -466,12 +467,10 @@ def _known_before_wrist(
     track: Track, fitted: FittedHands, rig: Rig
 ) -> list[Bool[np.ndarray, "_ _"]]:
     """Pixels of the camera's picture in front of the wrist: what lies behind is the forearm's."""
-    rim = rig.rim.numpy()
     found = []
     for hand, vertices in zip(track.hands, fitted.vertices, strict=True):
         view = window_view(hand, fitted.fit.focal)
-        places = project(view, vertices)[0].double().numpy()
-        line = wrist_line(places[rim], places.mean(0))
+        line = _wrist_in(view, rig, vertices)
         margin = _WRIST_MARGIN * view.focal[0] / max(float(vertices[:, 2].median()), 0.02)
         before = line.before_pixels(view.width) > margin
         found.append(before & inside_picture(hand.window))
@@ -499,15 +498,19 @@ class _Box:
         return (x, y), self.side * window.scale
 
 
+def _wrist_in(camera: Camera, rig: Rig, vertices: Float[Tensor, "vertices 3"]) -> WristLine:
+    """Where the fitted hand ends, in a view of it."""
+    places = project(camera, vertices)[0].double().numpy()
+    return wrist_line(places[rig.rim.numpy()], places.mean(0))
+
+
 def _box_in_front(
     hand: TrackedHand, guided: GuidedMask, rig: Rig, fitted: FittedHands, number: int
 ) -> _Box:
     """About the mask in front of the wrist."""
-    window, rim = hand.window, rig.rim.numpy()
-    side = window.image.shape[0]
-    places = project(window_view(hand, fitted.fit.focal), fitted.vertices[number])[0]
-    in_window = places.double().numpy()
-    before = wrist_line(in_window[rim], in_window.mean(0)).before_pixels(side) > 0
+    window = hand.window
+    line = _wrist_in(window_view(hand, fitted.fit.focal), rig, fitted.vertices[number])
+    before = line.before_pixels(window.image.shape[0]) > 0
     corner, box = _box(guided.mask.pixels & before & inside_picture(window))
     x, y = (start + at / window.scale for start, at in zip(window.corner, corner, strict=True))
     return _Box((x, y), box / window.scale)
@@ -536,7 +539,6 @@ def _result(
     """One frame's crop, with its mask cut where the mesh ends."""
     window = hand.window
     fit, vertices = fitted.fit, fitted.vertices[number]
-    rim = rig.rim.numpy()
     camera = window_camera(fit.focal, window.picture_size, box.corner, box.side, size)
     fine_corner, fine_side = box.seen_in(hand.stored_from)
     image = resampled(
@@ -552,8 +554,7 @@ def _result(
     samples = -(-_MESH_SIDE // size)
     fine_camera = camera.resized(samples * size, samples * size)
     mesh = covered_shares(silhouette(rig, vertices, fine_camera), samples)
-    in_crop = project(camera, vertices)[0].double().numpy()
-    line = wrist_line(in_crop[rim], in_crop.mean(0))
+    line = _wrist_in(camera, rig, vertices)
     scale = camera.focal[0] / max(float(vertices[:, 2].median()), 0.02)
     cut = cut_at_wrist(shares, line)
     is_end = is_cut_unsure(mesh > 0.5, line, scale)

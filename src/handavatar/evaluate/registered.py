@@ -20,7 +20,7 @@ from handavatar.hand.rig import ShapedHand
 
 # Expected errors of the pose to start from: radians of a joint about each axis; metres
 # across and along the line of sight. Half a pixel by which outlines of avatar and picture differ
-# all around would move the hand by centimetres along it: it stays where outlines have put it.
+# all around would move the hand by millimetres along it: it stays where outlines have put it.
 _ROTATION_ERROR = math.radians(3) / 3**0.5
 _TRANSLATION_ERROR = (0.003, 0.003, 0.0005)
 # Of independent observations in each blurred pixel. With more, the texture draws hands off their

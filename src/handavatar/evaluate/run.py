@@ -20,6 +20,7 @@ from handavatar.capture.frames import (
     CaptureError,
     Frame,
     FrameRecord,
+    block_means,
     read_capture,
 )
 from handavatar.capture.registration import poses_of as registered_poses
@@ -410,7 +411,7 @@ def true_picture(capture: Capture, frame: Frame, kind: str) -> Tensor:
     mask = float_image(capture.folder / _record_of(capture, frame).mask_path) > 0.5
     image = image if image.ndim > 2 else image[..., None]
     values = torch.cat([image * mask[..., None], mask[..., None].float()], dim=-1)
-    means = values.unflatten(0, (-1, factor)).unflatten(2, (-1, factor)).mean((1, 3))
+    means = block_means(values, factor)
     found = means[..., :-1] / means[..., -1:].clamp_min(1e-6)
     return found if found.shape[-1] > 1 else found[..., 0]
 
@@ -478,14 +479,13 @@ def _write(
         f"protocol {name}; grey: nothing is known there",
         metrics={key: value for key, value in figures.items() if value is not None},
         rows=rows,
-        unseen=_unseen_rows(avatar),
+        unseen=_unseen_rows(avatar, metrics["skin_never_seen"]),
         curves=_curves(options.run),
         notes=metrics["notes"],
     )
 
 
-def _unseen_rows(avatar: HandAvatar) -> list[ReportRow]:
-    figures = unseen_figures(avatar)
+def _unseen_rows(avatar: HandAvatar, figures: dict[str, Any] | None) -> list[ReportRow]:
     if figures is None:
         return []
     said = f"{100 * figures['share']:.0f} % of the skin, in violet: how it looks there is a guess"
