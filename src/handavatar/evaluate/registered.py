@@ -23,8 +23,8 @@ from handavatar.hand.rig import ShapedHand
 # all around would move the hand by millimetres along it: it stays where outlines have put it.
 _ROTATION_ERROR = math.radians(3) / 3**0.5
 _TRANSLATION_ERROR = (0.003, 0.003, 0.0005)
-# Of independent observations in each blurred pixel. With more, the texture draws hands off their
-# outlines; on made frames, whose poses are known, this is the best of 0.1, 0.5 and 2.
+# Of independent observations in each blurred pixel. With more, as much as videos have, the texture
+# draws hands off their outlines.
 _TEXTURE_SHARE = 0.5
 
 
