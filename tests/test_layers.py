@@ -8,7 +8,7 @@ from source_tree import imported_modules, modules
 # Left: a folder or top module. Right: what it may import besides itself.
 EVERYTHING_BELOW = (
     "geometry jobs hand fit capture field render edit replay avatar plain retouch processes "
-    "alignment animate evaluate train peers export view demo doctor synthetic bench"
+    "alignment animate evaluate train peers export view demo doctor synthetic bench tracker"
 )
 MAY_IMPORT = {
     name: set(allowed.split())
@@ -21,7 +21,9 @@ MAY_IMPORT = {
         "render": "geometry hand",
         # A hand laid onto pictures.
         "fit": "geometry jobs hand render",
-        "capture": "geometry jobs hand render fit",
+        # The network that sees hands; knows pictures, not videos.
+        "tracker": "geometry jobs hand",
+        "capture": "geometry jobs hand render fit tracker",
         "field": "geometry jobs hand",
         "edit": "hand field",
         # A function's work on a GPU, recorded.
@@ -40,7 +42,7 @@ MAY_IMPORT = {
             "geometry jobs hand fit capture field render avatar plain alignment evaluate processes"
         ),
         # Made videos with truth: a subject of the made captures before a background.
-        "synthetic": "geometry jobs hand capture render",
+        "synthetic": "geometry jobs hand capture render tracker",
         # Registration against truth; it runs what training begins with, on captures and films.
         "bench": "geometry jobs hand fit capture render evaluate train synthetic",
         # Prior art, for a table alone.

@@ -374,23 +374,26 @@ def test_what_is_known_gains_and_covariances_come_back(tmp_path: Path) -> None:
         assert not bool(found.mask[:, :3].any()) and bool(found.mask.any())
 
 
-def sighting(index: int) -> LandmarkSightings:
+def sighting(index: int, vertices: tuple[int, ...] = ()) -> LandmarkSightings:
     generator = torch.Generator().manual_seed(index)
+    count = 21 + len(vertices)
     return LandmarkSightings(
-        torch.rand(21, 2, generator=generator),
-        torch.rand(21, generator=generator) + 0.1,
-        torch.rand(21, generator=generator),
-        torch.rand(21, generator=generator) + 0.1,
+        torch.rand(count, 2, generator=generator),
+        torch.rand(count, generator=generator) + 0.1,
+        torch.rand(count, generator=generator),
+        torch.rand(count, generator=generator) + 0.1,
         torch.rand(21, 3, generator=generator),
+        torch.tensor(vertices, dtype=torch.long),
     )
 
 
-def test_landmarks_come_back(tmp_path: Path) -> None:
-    frames = [replace(make_frame(index), landmarks=sighting(index)) for index in range(2)]
+@pytest.mark.parametrize("vertices", [(), (7, 3, 1500)])
+def test_landmarks_come_back(tmp_path: Path, vertices: tuple[int, ...]) -> None:
+    frames = [replace(make_frame(index), landmarks=sighting(index, vertices)) for index in range(2)]
     capture = write_capture(tmp_path / "c", frames, **HEADER)
     for index, frame in enumerate(frames):
         found = capture.frame(index).landmarks
-        for name in ("directions", "errors", "depths", "depth_errors", "offsets"):
+        for name in ("directions", "errors", "depths", "depth_errors", "offsets", "vertices"):
             assert torch.equal(getattr(found, name), getattr(frame.landmarks, name))
     with pytest.raises(CaptureError, match="1 of 2 frames have landmarks"):
         write_capture(tmp_path / "d", [frames[0], make_frame(1)], **HEADER)
@@ -404,6 +407,7 @@ def test_landmarks_come_back(tmp_path: Path) -> None:
         ({"depths": torch.full((2, 21), math.nan)}, "depths has shape .* not finite"),
         ({"directions": torch.zeros(3, 21, 2)}, "directions has shape"),
         ({"offsets": None}, "cannot be read"),
+        ({"vertices": torch.zeros(2, 4)}, "directions has shape"),
     ],
 )
 def test_landmarks_that_do_not_fit_the_frames_are_refused(tmp_path: Path, change, what) -> None:

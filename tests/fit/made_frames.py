@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from handavatar.fit.contact import fill_with_balls
@@ -82,30 +82,40 @@ def observed(
     return Observation(picture, time)
 
 
+NO_SKIN = torch.zeros(0, dtype=torch.long)
+
+
 def sightings(
-    hand: ShapedHand, pose: HandPose, camera: Camera, pixels_off: float = 3.0
+    hand: ShapedHand,
+    pose: HandPose,
+    camera: Camera,
+    pixels_off: float = 3.0,
+    vertices: Int[Tensor, "skin"] = NO_SKIN,
 ) -> LandmarkSightings:
     """What an exact tracker sees, moved by some pixels and two centimetres in depth."""
     space = fixed_shape(hand.rig)
-    rest = landmark_rest(hand, space, torch.zeros(63))
+    rest = landmark_rest(hand, space, torch.zeros(63), vertices)
+    count = len(rest.positions)
     skeleton = Skeleton.of(hand, pose, space.joint_directions).padded(63)
     pixels, depths = project(camera, skeleton.positions(rest))
     generator = torch.Generator().manual_seed(5)
-    pixels = pixels + pixels_off * torch.randn(21, 2, generator=generator)
-    depths = depths + 0.02 * torch.randn(21, generator=generator)
+    pixels = pixels + pixels_off * torch.randn(count, 2, generator=generator)
+    depths = depths + 0.02 * torch.randn(count, generator=generator)
     focal, center = torch.tensor(camera.focal), torch.tensor(camera.center)
     return LandmarkSightings(
         (pixels - center) / focal,
-        (1 + 2 * torch.rand(21, generator=generator)) / focal[0],
+        (1 + 2 * torch.rand(count, generator=generator)) / focal[0],
         depths - depths.mean(),
-        torch.full((21,), 0.02),
+        torch.full((count,), 0.02) * (1 + torch.arange(count) / count),
         torch.zeros(21, 3),
+        vertices,
     )
 
 
-def with_landmarks(points: HandPoints) -> HandPoints:
-    """The same hand, with what a tracker's landmarks are on it."""
-    return replace(points, landmarks=landmark_rest(points.hand, points.space, torch.zeros(63)))
+def with_landmarks(points: HandPoints, vertices: Int[Tensor, "skin"] = NO_SKIN) -> HandPoints:
+    """The same hand, with what a tracker's landmarks and points of the skin are on it."""
+    rest = landmark_rest(points.hand, points.space, torch.zeros(63), vertices)
+    return replace(points, landmarks=rest)
 
 
 def observe_all(hand: ShapedHand, poses: HandPose, camera: Camera) -> list[Observation]:

@@ -94,9 +94,12 @@ def _close(gradient: torch.Tensor, slope: torch.Tensor) -> tuple[float, float]:
 SEEN_WELL = [0, 1, 2, 3, 5, 12, 14, 15, 21, 24, 30, 33, 39, 40, 41, 48, 49, 50]
 
 
-def test_the_slope_of_landmarks_is_exact(rig: Rig) -> None:
+@pytest.mark.parametrize("skin", [(), (30, 500, 700)])
+def test_the_slope_of_landmarks_is_exact(rig: Rig, skin: tuple[int, ...]) -> None:
     camera = camera_over(SIZE)
-    points = with_landmarks(points_on(rig.shaped(), ShapeSpace.around(rig, 0.5, 2), 20))
+    vertices = torch.tensor(skin, dtype=torch.long)
+    points = points_on(rig.shaped(), ShapeSpace.around(rig, 0.5, 2), 20)
+    points = with_landmarks(points, vertices)
     pose = pose_at(calm_poses(rig, 1), 0)
     blank = FramePicture.of(
         camera,
@@ -105,7 +108,7 @@ def test_the_slope_of_landmarks_is_exact(rig: Rig) -> None:
         torch.zeros(SIZE, SIZE, dtype=torch.bool),
         torch.ones(3),
     )
-    seen = Observation(blank, 0.0, sightings(points.hand, pose, camera))
+    seen = Observation(blank, 0.0, sightings(points.hand, pose, camera, vertices=vertices))
     options = replace(SQUARES, outline_points=0.0)
     found = _linearised(points, pose, seen, options)
     assert found.gradient.shape == (NUM_UNKNOWNS + 12 + 63,)
@@ -119,7 +122,7 @@ def test_the_slope_of_landmarks_is_exact(rig: Rig) -> None:
             shared = torch.zeros(75)
             shared[unknown] = sign * (1e-2 if unknown < 10 else 1e-4)
             hand = points.space.shaped(points.hand, shared[:12])
-            rest = landmark_rest(hand, points.space, shared[12:])
+            rest = landmark_rest(hand, points.space, shared[12:], vertices)
             at = replace(points, hand=hand, landmarks=rest)
             ends.append(_linearised(at, pose, seen, options).energy)
         slope = (ends[0] - ends[1]) / (2 * abs(float(shared[unknown])))

@@ -5,14 +5,17 @@ First the landmarks alone decide; then the mesh's outline is drawn to the mask's
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.capture.fitted_hand import HandFit, HandModel, projected
+from handavatar.capture.skin_points import SeenPoints
 from handavatar.geometry.rotations import axis_angle_from_matrix
 from handavatar.hand.pose import FINGER_BONES
 from handavatar.hand.pose_sampling import (
@@ -27,6 +30,8 @@ _LONG_FINGERS = ("index", "middle", "ring", "little")
 _PALM_LANDMARKS = (0, 1, 5, 9, 13, 17)
 _RETRY_GESTURES = ("fist", "relaxed", "pinch")
 _BAD_RATIO = 1.6
+LANDMARK_ERROR = 0.004
+"""Metres by which a landmark is off, beside what the tracker itself admits."""
 _OUTLINE_WEIGHT = 64
 
 
@@ -38,7 +43,7 @@ class FitOptions:
     """Focal length over the longer side of the picture: phones and webcams have 0.75 to 1.2."""
     focal_tolerance: float = 0.1
     """Standard deviation of the logarithm of the focal length."""
-    landmark_error: float = 0.004
+    landmark_error: float = LANDMARK_ERROR
     """Metres by which a tracked landmark is off, beside what the tracker itself admits."""
     outline_error: float = 0.0012
     """Metres between the outlines of mesh and mask in a good fit."""
@@ -54,6 +59,25 @@ class FitOptions:
 
 
 @dataclass(frozen=True, eq=False)
+class SkinObservations:
+    """Landmarks and points of the skin, as our own tracker sees them.
+
+    Attributes:
+        vertices: of the rig: which points of the skin follow the landmarks.
+        places: pixels of the picture.
+        errors: expected, of each coordinate, pixels.
+        depths: behind the wrist, metres.
+        depth_errors: expected, metres.
+    """
+
+    vertices: Int[Tensor, "skin"]
+    places: Float[Tensor, "frames points 2"]
+    errors: Float[Tensor, "frames points"]
+    depths: Float[Tensor, "frames points"]
+    depth_errors: Float[Tensor, "frames points"]
+
+
+@dataclass(frozen=True, eq=False)
 class Observations:
     """What was seen of a right hand in some frames of one video.
 
@@ -64,6 +88,7 @@ class Observations:
         scale: picture pixels per metre at the hand.
         times: seconds.
         picture_size: width and height, pixels.
+        skin: what our own tracker sees beside them; None where it was not asked.
     """
 
     landmarks: Float[Tensor, "frames 21 2"]
@@ -72,6 +97,7 @@ class Observations:
     scale: Float[Tensor, "frames"]
     times: Float[Tensor, "frames"]
     picture_size: tuple[int, int]
+    skin: SkinObservations | None = None
 
     def chosen(self, frames: Int[Tensor, "chosen"]) -> "Observations":
         """The same of some frames; they may repeat."""
@@ -83,6 +109,57 @@ class Observations:
             self.times[frames],
             self.picture_size,
         )
+
+
+HAND_SIZE = 0.093
+"""Metres from the wrist's joint to the middle finger's knuckle: the unit of our tracker's depths."""
+OWN_ERROR = 0.002
+"""Metres by which points of our own tracker are off in the picture, beside what it admits."""
+OWN_DEPTH_ERROR = 0.004
+"""Metres by which their depths are off, beside what it admits."""
+
+
+def with_skin(
+    seen: Observations, points: Sequence[SeenPoints], vertices: Int[Tensor, "skin"]
+) -> Observations:
+    """Landmarks of both trackers in one, each as far as it is sure, and our own's skin and depths.
+
+    Args:
+        seen: by the other tracker.
+        points: by our own, in the same frames.
+        vertices: of the rig, which points behind the landmarks are; of another rig none.
+    """
+
+    def stacked(name: str) -> Tensor:
+        values = torch.from_numpy(np.stack([getattr(point, name) for point in points])).float()
+        return values[:, : seen.landmarks.shape[1] + len(vertices)]
+
+    count, scale = seen.landmarks.shape[1], seen.scale[:, None]
+    places, errors = stacked("places"), stacked("errors").hypot(OWN_ERROR * scale)
+    depths = HAND_SIZE * stacked("depths")
+    depth_errors = (HAND_SIZE * stacked("depth_errors")).hypot(torch.tensor(OWN_DEPTH_ERROR))
+    other = seen.uncertainty.hypot(LANDMARK_ERROR * scale)
+    own = errors[:, :count]
+    share = (own**-2 / (own**-2 + other**-2))[..., None]
+    both = share * places[:, :count] + (1 - share) * seen.landmarks
+    apart = (places[:, :count] - seen.landmarks).square().mean(-1)
+    # Where they contradict each other one of them is wrong, and nobody knows which.
+    contradiction = (share * (1 - share))[..., 0] * apart
+    error = (1 / (own**-2 + other**-2) + contradiction).sqrt()
+    across = (both - both.mean(1, keepdim=True)) / scale[..., None]
+    return replace(
+        seen,
+        landmarks=both,
+        uncertainty=error,
+        world_landmarks=torch.cat([across, depths[:, :count, None]], dim=-1),
+        skin=SkinObservations(
+            vertices,
+            torch.cat([both, places[:, count:]], dim=1),
+            torch.cat([error, errors[:, count:]], dim=1),
+            depths,
+            depth_errors,
+        ),
+    )
 
 
 @dataclass(frozen=True, eq=False)

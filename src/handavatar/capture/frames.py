@@ -28,7 +28,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -42,7 +42,7 @@ from handavatar.capture.checks import (
     path_inside,
     text_field,
 )
-from handavatar.fit.landmarks import LandmarkSightings
+from handavatar.fit.landmarks import NUM_LANDMARKS, LandmarkSightings
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.rotations import invert_rigid
 from handavatar.hand.pose import NUM_BONES, HandPose
@@ -70,13 +70,20 @@ COVARIANCES = "covariances.safetensors"
 LANDMARKS = "landmarks.safetensors"
 """File of a capture: the fields of ``LandmarkSightings``, stacked in the order of the frames."""
 _MAKE_AGAIN = "make the capture again, or delete this file: poses then count as less sure"
-_LANDMARK_SHAPES: dict[str, tuple[int, ...]] = {
-    "directions": (21, 2),
-    "errors": (21,),
-    "depths": (21,),
-    "depth_errors": (21,),
-    "offsets": (21, 3),
-}
+
+
+def _landmark_shapes(num_skin: int) -> dict[str, tuple[int, ...]]:
+    """Of one frame's landmarks, behind which points of the skin may follow."""
+    count = NUM_LANDMARKS + num_skin
+    shapes: dict[str, tuple[int, ...]] = {
+        "directions": (count, 2),
+        "errors": (count,),
+        "depths": (count,),
+        "depth_errors": (count,),
+        "offsets": (NUM_LANDMARKS, 3),
+    }
+    # Captures of a tracker that tells landmarks alone have no such tensor.
+    return shapes | ({"vertices": (num_skin,)} if num_skin else {})
 
 
 def _is_older_capture(folder: Path) -> bool:
@@ -325,9 +332,14 @@ class Capture:
         Raises:
             CaptureError: if the file does not fit the frames.
         """
-        found = self._frame_tensors(LANDMARKS, _LANDMARK_SHAPES)
+        found = self._frame_tensors(LANDMARKS, _landmark_shapes(self._num_skin_points()))
         if found is None:
             return None
+        if "vertices" in found:
+            numbers = found["vertices"]
+            if not bool((numbers >= 0).all()) or not torch.equal(numbers, numbers.round()):
+                raise CaptureError(f"{LANDMARKS}: vertices are no numbers of any", _MAKE_AGAIN)
+            found["vertices"] = numbers.long()
         for name in ("errors", "depth_errors"):
             if not bool((found[name] > 0).all()):
                 raise CaptureError(f"{LANDMARKS}: {name} are not above zero", _MAKE_AGAIN)
@@ -335,6 +347,16 @@ class Capture:
             LandmarkSightings(**{name: values[index] for name, values in found.items()})
             for index in range(len(self.records))
         )
+
+    def _num_skin_points(self) -> int:
+        """How many points of the skin follow the landmarks, as their file says."""
+        path = self.folder / LANDMARKS
+        try:
+            with safe_open(path, "pt") as file:
+                return int(file.get_slice("vertices").get_shape()[-1])
+        except (SafetensorError, OSError):
+            # Landmarks alone; or whatever else is wrong with it is said where it is read.
+            return 0
 
     def _frame_tensors(
         self, file: str, shapes: dict[str, tuple[int, ...]]
@@ -773,7 +795,7 @@ class CaptureWriter:
         if landmarks:
             tensors = {
                 name: _stacked([getattr(seen, name) for seen in landmarks])
-                for name in _LANDMARK_SHAPES
+                for name in _landmark_shapes(len(landmarks[0].vertices))
             }
             save_file(tensors, self._aside / LANDMARKS)
         with open(self._aside / "transforms.json", "w", encoding="utf-8") as stream:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from handavatar.capture.fitted_hand import HandFit
-from handavatar.capture.fitting import Observations
+from handavatar.capture.fitting import LANDMARK_ERROR, Observations
 from handavatar.capture.frames import FITTED_SIDE, Capture, Frame
 from handavatar.capture.masks import HandMask, mask_coverage
 from handavatar.capture.tracking import TrackedHand
@@ -26,8 +26,6 @@ from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.rig import Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
 
-LANDMARK_ERROR = 0.004
-"""Metres by which a landmark is off, beside what the tracker itself admits."""
 DEPTH_ERROR = 0.025
 """Metres by which its depth is off: measured on made films."""
 _POSE_ERROR = np.radians(90.0) / 3**0.5
@@ -53,6 +51,21 @@ def see_landmarks(seen: Observations, fit: HandFit) -> list[LandmarkSightings]:
         fit: focal length, and where landmarks lie beside joints.
     """
     center = torch.tensor(seen.picture_size) / 2
+    if seen.skin is not None:
+        own = seen.skin
+        return [
+            LandmarkSightings(
+                (places - center) / fit.focal,
+                error / fit.focal,
+                depth - depth.mean(),
+                depth_error,
+                fit.offsets,
+                own.vertices,
+            )
+            for places, error, depth, depth_error in zip(
+                own.places, own.errors, own.depths, own.depth_errors, strict=True
+            )
+        ]
     errors = torch.hypot(seen.uncertainty, LANDMARK_ERROR * seen.scale[:, None]) / fit.focal
     depths = seen.world_landmarks[..., 2]
     return [

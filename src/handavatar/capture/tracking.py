@@ -17,6 +17,7 @@ from PIL import Image
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import VideoFrame
+from handavatar.capture.skin_points import SeenPoints
 from handavatar.capture.windows import FINE_SIDE, MASK_SIDE, Window, resampled, window_around
 
 NUM_LANDMARKS = 21
@@ -72,6 +73,7 @@ class TrackedHand:
         world_landmarks: metres about the hand's centre, camera axes.
         presence: the tracker's certainty, in [0, 1].
         fine: the same surroundings with up to twice the pixels; None where the video has no more.
+        points: what our own tracker sees there; None where it was not asked.
     """
 
     index: int
@@ -82,6 +84,7 @@ class TrackedHand:
     world_landmarks: Float[np.ndarray, "21 3"]
     presence: float
     fine: Window | None = None
+    points: SeenPoints | None = None
 
     @property
     def stored_from(self) -> Window:

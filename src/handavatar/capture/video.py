@@ -24,6 +24,7 @@ from handavatar.capture.fitting import (
     Observations,
     fit_hands,
     landmark_errors,
+    with_skin,
 )
 from handavatar.capture.frames import SPLITS, Capture, CaptureWriter, Frame, read_capture
 from handavatar.capture.guided_masks import (
@@ -56,8 +57,10 @@ from handavatar.capture.registration import (
     window_view,
 )
 from handavatar.capture.seen_skin import SeenSkin, count_seen_skin
+from handavatar.capture.skin_points import see_points
 from handavatar.capture.tracking import (
     NO_HAND,
+    NUM_LANDMARKS,
     OTHER_HAND,
     TWO_HANDS,
     Track,
@@ -74,6 +77,7 @@ from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import FolderKind, files_named, mark_folder
 from handavatar.jobs.threads import one_thread
+from handavatar.tracker.model import shipped_tracker
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
@@ -115,6 +119,9 @@ class VideoOptions:
     """Stop after this many pictures."""
     side: Literal["auto", "left", "right"] = "auto"
     """Which hand it is; auto takes the video as not mirrored."""
+    tracker: Literal["mediapipe", "both"] = "mediapipe"
+    """Who tells where landmarks are: mediapipe alone, or our own tracker too, once that has found
+    the hand."""
     size: int | None = None
     """Side of the stored pictures, pixels; by default 512 where hands are as large, else 256."""
     min_confidence: float = 0.5
@@ -280,6 +287,8 @@ def capture_video(
         )
     except UnusableTrackError as error:
         raise _failure(options, error.what, error.remedy, error.track, []) from error
+    if options.tracker == "both":
+        track = see_skin(track, rig)
     # By time, over all pictures, before anybody knows which of them can be fitted.
     splits = splits_by_index(track)
     fitted, results = _laid_on(track, rig, options, report)
@@ -408,12 +417,12 @@ def _on_all_cores(
 
 
 def observations_of(track: Track) -> Observations:
-    """What the tracker saw, as tensors."""
+    """What the trackers saw, as tensors."""
 
     def stacked(values: list[object]) -> Tensor:
         return torch.from_numpy(np.array(values)).float()
 
-    return Observations(
+    seen = Observations(
         landmarks=stacked([hand.landmarks for hand in track.hands]),
         uncertainty=stacked([hand.spread for hand in track.hands]),
         world_landmarks=stacked([hand.world_landmarks for hand in track.hands]),
@@ -421,6 +430,29 @@ def observations_of(track: Track) -> Observations:
         times=stacked([hand.time for hand in track.hands]),
         picture_size=track.picture_size,
     )
+    points = [hand.points for hand in track.hands if hand.points is not None]
+    if len(points) < len(track.hands):
+        return seen
+    num_skin = len(points[0].places) - NUM_LANDMARKS
+    return with_skin(seen, points, shipped_tracker().points.vertices[:num_skin])
+
+
+def see_skin(track: Track, rig: Rig) -> Track:
+    """Asks our own tracker where landmarks and skin are in every picture of a track.
+
+    Args:
+        track: hands that were found.
+        rig: to lay onto the pictures; of one that is not the tracker's, landmarks alone are told.
+    """
+    tracker = shipped_tracker()
+    count = len(tracker.points) if tracker.points.fit(rig) else NUM_LANDMARKS
+    points = _on_all_cores(
+        lambda hand: see_points(tracker, hand.window, hand.landmarks).first(count),
+        track.hands,
+        lambda share: None,
+    )
+    hands = [replace(hand, points=seen) for hand, seen in zip(track.hands, points, strict=True)]
+    return replace(track, hands=tuple(hands))
 
 
 @one_thread()

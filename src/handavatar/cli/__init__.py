@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from handavatar import __version__
-from handavatar.cli import avatar, bench, capture, default, prior, rig
+from handavatar.cli import avatar, bench, capture, default, prior, rig, tracker
 from handavatar.cli.failures import USAGE, report_failure
 
 Command = Callable[[list[str]], int]
@@ -29,6 +29,8 @@ COMMANDS: dict[str, Command] = {
     "prior train": prior.train,
     "prior evaluate": prior.evaluate,
     "prior picture": prior.picture,
+    "tracker train": tracker.train,
+    "tracker evaluate": tracker.evaluate,
     "train": avatar.train,
     "evaluate": avatar.evaluate,
     "edit": avatar.edit,

@@ -23,7 +23,7 @@ from handavatar.fit.kinematics import (
     pixel_jacobian,
     rest_with_pose,
 )
-from handavatar.fit.landmarks import LandmarkSightings
+from handavatar.fit.landmarks import NUM_LANDMARKS, LandmarkSightings
 from handavatar.fit.pictures import FramePicture, PictureBand, drawing_camera
 from handavatar.fit.shape import ShapeSpace
 from handavatar.geometry.cameras import Camera
@@ -61,6 +61,10 @@ class EnergyOptions:
     landmark_outlier: float = 8.0
     """Standard deviations beyond which a landmark is misplaced: where a finger lies on the palm
     the outline says nothing, and would be let to have its way."""
+    skin_share: float = 0.3
+    """Weight of a point of the skin that a tracker sees: neighbours err together."""
+    depth_share: float = 0.5
+    """Weight of a landmark's depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -331,16 +335,21 @@ def _add_landmarks(
     in_picture = (moving @ jacobian) / errors[..., None]
     apart = (pixels - landmarks.directions * focal - center) / errors
     distance = apart.norm(dim=-1, keepdim=True).expand(-1, 2)
-    ones = torch.ones(2 * len(apart))
+    shares = torch.ones(len(apart))
+    shares[NUM_LANDMARKS:] = options.skin_share
     total.add(
         apart.flatten(),
         in_picture.flatten(0, 1),
-        ones,
+        shares[:, None].expand(-1, 2).flatten(),
         options.landmark_outlier,
         distance.flatten(),
     )
     sight = camera.camera_from_world[2, :3]
     along = (sight @ jacobian).reshape(len(depths), -1)
-    along = (along - along.mean(0)) / landmarks.depth_errors[:, None]
-    depths = (depths - depths.mean() - landmarks.depths) / landmarks.depth_errors
-    total.add(depths, along, torch.full((len(depths),), 0.5), options.landmark_outlier)
+    # About their mean, in which a point counts for what it knows.
+    known = shares / landmarks.depth_errors.square()
+    known = known / known.sum()
+    along = (along - known @ along) / landmarks.depth_errors[:, None]
+    seen_depths = landmarks.depths - known @ landmarks.depths
+    depths = (depths - known @ depths - seen_depths) / landmarks.depth_errors
+    total.add(depths, along, options.depth_share * shares, options.landmark_outlier)

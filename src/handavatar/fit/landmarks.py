@@ -1,13 +1,13 @@
-"""What a tracker's 21 landmarks are on a rig: joints and fingertips, each with its own offset.
+"""What a tracker sees, on a rig: joints and fingertips, each with its own offset, and skin.
 
 Trackers are taught by people who click on knuckles; a rig's joints lie inside. The difference is
 the same in every frame, in the axes of the bone, and is learned over the clip.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.fit.kinematics import RestPoints
@@ -15,8 +15,8 @@ from handavatar.fit.shape import ShapeSpace
 from handavatar.hand.pose import FINGER_BONES, NUM_BONES
 from handavatar.hand.rig import ShapedHand
 
-NUM_OFFSETS = 63
-"""Three for each landmark."""
+NUM_LANDMARKS = 21
+NUM_OFFSETS = 3 * NUM_LANDMARKS
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
 _TOLERANCES = {"wrist": 0.010, "cmc": 0.008, "mcp": 0.006, "tip": 0.004}
 _TOLERANCE = 0.003
@@ -26,6 +26,8 @@ _TOLERANCE = 0.003
 class LandmarkSightings:
     """A tracker's landmarks in one frame, as any picture of its camera has them.
 
+    Points are the 21 landmarks and, of a tracker that sees them, vertices of the skin.
+
     Attributes:
         directions: x and y over z, in the camera's axes (OpenCV).
         errors: expected, of x and of y alike.
@@ -33,22 +35,30 @@ class LandmarkSightings:
         depth_errors: expected, metres.
         offsets: from the rig's joints and fingertips to the landmarks, metres in the rest axes of
             their bone, as far as they are known.
+        vertices: of the rig, that the points behind the landmarks are.
     """
 
-    directions: Float[Tensor, "21 2"]
-    errors: Float[Tensor, "21"]
-    depths: Float[Tensor, "21"]
-    depth_errors: Float[Tensor, "21"]
+    directions: Float[Tensor, "points 2"]
+    errors: Float[Tensor, "points"]
+    depths: Float[Tensor, "points"]
+    depth_errors: Float[Tensor, "points"]
     offsets: Float[Tensor, "21 3"]
+    vertices: Int[Tensor, "skin"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
 
 
-def landmark_rest(hand: ShapedHand, space: ShapeSpace, offsets: Float[Tensor, "63"]) -> RestPoints:
+def landmark_rest(
+    hand: ShapedHand,
+    space: ShapeSpace,
+    offsets: Float[Tensor, "63"],
+    vertices: Int[Tensor, "skin"] | None = None,
+) -> RestPoints:
     """The landmarks in the zero pose; unknowns are those of the shape, and then the offsets.
 
     Args:
         hand: rest hand, its shape as it is.
         space: how its shape moves.
         offsets: of the landmarks, metres in the rest axes of their bone.
+        vertices: further points, of the skin.
     """
     tips = hand.rig.vertex_sets["fingertips"]
     bones, rows = [0], [0]
@@ -59,11 +69,15 @@ def landmark_rest(hand: ShapedHand, space: ShapeSpace, offsets: Float[Tensor, "6
     places = torch.cat([hand.rest_joints, hand.rest_vertices[tips]])[rows]
     moving = torch.cat([space.joint_directions, space.directions[tips]])[rows]
     own = torch.eye(NUM_OFFSETS).reshape(21, 3, NUM_OFFSETS)
-    return RestPoints(
-        places + offsets.reshape(21, 3),
-        torch.nn.functional.one_hot(torch.tensor(bones), NUM_BONES).to(places),
-        torch.cat([moving, own], dim=-1),
-    )
+    weights = torch.nn.functional.one_hot(torch.tensor(bones), NUM_BONES).to(places)
+    places = places + offsets.reshape(21, 3)
+    directions = torch.cat([moving, own], dim=-1)
+    if vertices is not None and len(vertices):
+        still = own.new_zeros(len(vertices), 3, NUM_OFFSETS)
+        places = torch.cat([places, hand.rest_vertices[vertices]])
+        weights = torch.cat([weights, hand.rig.skin_weights[vertices]])
+        directions = torch.cat([directions, torch.cat([space.directions[vertices], still], dim=-1)])
+    return RestPoints(places, weights, directions)
 
 
 def offset_tolerances() -> Float[Tensor, "63"]:

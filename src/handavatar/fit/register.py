@@ -171,14 +171,17 @@ def _register(
     space = ShapeSpace.around(rig, options.coefficient_sigma) if learns_shape else fixed_shape(rig)
     generator = torch.Generator().manual_seed(options.seed)
     surface, balls = _compared_points(rig), fill_with_balls(rig)
-    known_offsets = [seen.landmarks.offsets for seen in observations if seen.landmarks is not None]
-    has_landmarks = len(known_offsets) > 0
+    sightings = [seen.landmarks for seen in observations if seen.landmarks is not None]
+    has_landmarks = len(sightings) > 0
+    skin = sightings[0].vertices if has_landmarks else None
     num_shapes = len(space.sigmas)
 
     def points_of(shared: Float[Tensor, "shared"], frame: int) -> HandPoints:
         shaped = space.shaped(hands[frame if len(hands) > 1 else 0], shared[:num_shapes])
         landmarks = (
-            landmark_rest(shaped, space, shared[num_shapes:]) if has_landmarks else _NO_LANDMARKS
+            landmark_rest(shaped, space, shared[num_shapes:], skin)
+            if has_landmarks
+            else _NO_LANDMARKS
         )
         return HandPoints(shaped, space, surface, balls, landmarks)
 
@@ -187,7 +190,7 @@ def _register(
     sigmas = torch.cat([space_sigmas, offset_tolerances()]) if has_landmarks else space_sigmas
     shared = torch.zeros(len(sigmas))
     if has_landmarks:
-        shared[num_shapes:] = torch.stack(known_offsets).mean(0).flatten()
+        shared[num_shapes:] = torch.stack([seen.offsets for seen in sightings]).mean(0).flatten()
 
     error = options.pose_error
     is_learned = information is None and options.learns_pose_error

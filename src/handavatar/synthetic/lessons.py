@@ -1,0 +1,203 @@
+"""``handavatar tracker train|evaluate``: makes pictures, teaches the tracker, judges it."""
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from handavatar.capture.checks import CaptureError
+from handavatar.hand.rigs import load_rig
+from handavatar.synthetic.crops import make_crops
+from handavatar.tracker.measures import TrackerFigures, measure_tracker
+from handavatar.tracker.model import TrainedTracker, read_tracker, save_tracker, shipped_tracker
+from handavatar.tracker.network import HandNetwork
+from handavatar.tracker.points import TrackedPoints
+from handavatar.tracker.training import CropBatch, TrackerOptions, TrackerTraining
+
+RIG = "open-hand"
+NUM_SKIN_POINTS = 64
+IN_A_FILE = 1000
+"""Pictures of a file."""
+_JUDGED_FROM = 1_000_000
+"""Seeds from here on are never taught with."""
+Report = Callable[[str, int, int, float], None]
+"""Told what is being done, how much of it, of how much, and the loss."""
+
+
+@dataclass(frozen=True)
+class TrackerTrainOptions:
+    """How a tracker is taught."""
+
+    out: Path
+    """file of the tracker, such as tracker.safetensors"""
+    pictures: Path = Path("tracker-pictures")
+    """folder of made pictures, 50 MB a thousand; those that are missing are made"""
+    count: int = 100_000
+    """made pictures"""
+    steps: int = 7000
+    """of training, 64 pictures each"""
+    seed: int = 0
+    """first seed of the pictures"""
+    device: str = "cpu"
+    """where the network is taught"""
+    processes: int = 0
+    """that make pictures; 0: one a core"""
+    resume: bool = False
+    """go on where a training of this file ended, or was ended"""
+
+
+@dataclass(frozen=True)
+class TrackerEvaluateOptions:
+    """How a tracker is judged."""
+
+    tracker: Path | None = None
+    """file; the one that ships if None"""
+    count: int = 2000
+    """made pictures that none was taught with"""
+
+
+def train_made_tracker(
+    options: TrackerTrainOptions, report: Report | None = None
+) -> TrainedTracker:
+    """Makes what pictures are missing, teaches a network, writes it.
+
+    Raises:
+        CaptureError: nothing to go on with, or a damaged file of pictures.
+    """
+    tell = report or (lambda doing, done, total, loss: None)
+    state_file = options.out.with_suffix(".state")
+    if options.resume and not state_file.is_file():
+        raise CaptureError(
+            f"{state_file}: there is nothing to go on with", "train without --resume"
+        )
+    rig = load_rig(RIG)
+    points = TrackedPoints.of(rig, NUM_SKIN_POINTS)
+    files = make_pictures(options, lambda done, total: tell("pictures", done, total, 0.0))
+    torch.manual_seed(options.seed)
+    network = HandNetwork(len(points)).to(options.device)
+    training = TrackerTraining(network, TrackerOptions(), options.steps, options.seed)
+    if options.resume:
+        training.restore(torch.load(state_file, weights_only=True))
+    lessons = draw_lessons(read_pictures(files), training)
+    saved = time.monotonic()
+    for batch in lessons:
+        loss = training.teach(batch)
+        tell("training", training.step, options.steps, loss)
+        if time.monotonic() - saved > 120 or training.step == options.steps:
+            _save_aside(state_file, training)
+            saved = time.monotonic()
+    tracker = TrainedTracker(training.taught().cpu(), points)
+    record = {
+        "pictures": IN_A_FILE * len(files),
+        "steps": training.step,
+        "seed": options.seed,
+        "options": asdict(TrackerOptions()),
+    }
+    save_tracker(options.out, tracker, record)
+    return tracker
+
+
+def evaluate_made_tracker(options: TrackerEvaluateOptions) -> TrackerFigures:
+    """Judges a tracker on pictures of subjects, poses and scenes of their own.
+
+    Raises:
+        TrackerError: the file is no tracker.
+    """
+    tracker = read_tracker(options.tracker) if options.tracker else shipped_tracker()
+    rig = load_rig(tracker.points.rig_name)
+    made = [
+        make_crops(rig, tracker.points, min(500, options.count - start), _JUDGED_FROM + start)
+        for start in range(0, options.count, 500)
+    ]
+    batch = CropBatch(
+        **{
+            name: torch.from_numpy(np.concatenate([getattr(part, name) for part in made]))
+            for name in ("images", "classes", "points", "is_hand")
+        }
+    )
+    return measure_tracker(tracker, batch)
+
+
+def draw_lessons(pictures: CropBatch, training: TrackerTraining) -> Iterator[CropBatch]:
+    """Batches up to the last step, every picture once before any comes again."""
+    batch, total = training.options.batch, len(pictures.images)
+    order = torch.zeros(0, dtype=torch.long)
+    while training.step < training.steps:
+        if len(order) < batch:
+            order = torch.cat([order, torch.randperm(total, generator=training.generator)])
+        chosen, order = order[:batch], order[batch:]
+        yield CropBatch(
+            pictures.images[chosen],
+            pictures.classes[chosen],
+            pictures.points[chosen],
+            pictures.is_hand[chosen],
+        )
+
+
+def make_pictures(options: TrackerTrainOptions, report: Callable[[int, int], None]) -> list[Path]:
+    """Files of made pictures, of which those that are missing are made."""
+    options.pictures.mkdir(parents=True, exist_ok=True)
+    seeds = range(options.seed, options.seed + -(-options.count // IN_A_FILE))
+    files = [options.pictures / f"made-{seed:06d}.safetensors" for seed in seeds]
+    missing = [(file, seed) for file, seed in zip(files, seeds, strict=True) if not file.is_file()]
+    report(len(files) - len(missing), len(files))
+    if not missing:
+        return files
+    processes = options.processes or os.cpu_count() or 1
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        for done, _ in enumerate(pool.map(_make_file, *zip(*missing, strict=True)), start=1):
+            report(len(files) - len(missing) + done, len(files))
+    return files
+
+
+def _make_file(file: Path, seed: int) -> None:
+    torch.set_num_threads(1)
+    rig = load_rig(RIG)
+    made = make_crops(rig, TrackedPoints.of(rig, NUM_SKIN_POINTS), IN_A_FILE, seed)
+    tensors = {
+        name: torch.from_numpy(np.ascontiguousarray(values))
+        for name, values in {
+            "images": made.images,
+            # Maps have a quarter of the resolution; turned pictures are looked up in between.
+            "classes": made.classes[:, ::2, ::2],
+            "points": made.points,
+            "is_hand": made.is_hand,
+        }.items()
+    }
+    aside = file.with_suffix(f".{os.getpid()}")
+    save_file(tensors, aside)
+    aside.replace(file)
+
+
+def read_pictures(files: list[Path]) -> CropBatch:
+    """All pictures of some files, in memory.
+
+    Raises:
+        CaptureError: a file is damaged.
+    """
+    parts = []
+    for file in files:
+        try:
+            parts.append(load_file(file))
+        except (OSError, SafetensorError) as error:
+            raise CaptureError(f"{file} cannot be read ({error})", "delete it") from error
+    return CropBatch(
+        **{
+            name: torch.cat([part[name] for part in parts])
+            for name in ("images", "classes", "points", "is_hand")
+        }
+    )
+
+
+def _save_aside(path: Path, training: TrackerTraining) -> None:
+    aside = path.with_suffix(f".{os.getpid()}")
+    torch.save(training.state(), aside)
+    aside.replace(path)

@@ -1,0 +1,76 @@
+"""Which points of a hand the tracker tells: 21 landmarks, and points all over the skin."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from handavatar.hand.pose import FINGER_BONES, NUM_BONES, HandPose
+from handavatar.hand.rig import Rig, ShapedHand
+
+NUM_LANDMARKS = 21
+_FINGERS = ("thumb", "index", "middle", "ring", "little")
+MIDDLE_KNUCKLE = 9
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedPoints:
+    """Joints and fingertips of a rig in the usual order of 21 landmarks, then points of its skin.
+
+    Attributes:
+        rig_name: whose vertices they are.
+        rig_sha256: its fingerprint.
+        tips: vertices of the fingertips, thumb to little.
+        vertices: of the skin.
+    """
+
+    rig_name: str
+    rig_sha256: str
+    tips: Int[Tensor, "5"]
+    vertices: Int[Tensor, "skin"]
+
+    @classmethod
+    def of(cls, rig: Rig, count: int) -> "TrackedPoints":
+        """Points of a rig's skin that are as far from each other as can be.
+
+        Args:
+            rig: with fingertips.
+            count: of the points of its skin.
+        """
+        places = rig.template_vertices
+        tips = torch.as_tensor(rig.vertex_sets["fingertips"])
+        distance = (places[:, None] - places[tips]).norm(dim=-1).amin(1)
+        chosen = []
+        for _ in range(count):
+            farthest = int(distance.argmax())
+            chosen.append(farthest)
+            distance = distance.minimum((places - places[farthest]).norm(dim=-1))
+        return cls(rig.name, rig.sha256, tips, torch.tensor(chosen))
+
+    def fit(self, rig: Rig) -> bool:
+        """Whether they are points of a rig, so that its skin may be told, and not joints alone."""
+        return rig.sha256 == self.rig_sha256
+
+    def __len__(self) -> int:
+        """Number of points, landmarks included."""
+        return NUM_LANDMARKS + len(self.vertices)
+
+    @property
+    def knuckle(self) -> int:
+        """The landmark whose distance from the wrist, landmark 0, is a hand's size."""
+        return MIDDLE_KNUCKLE
+
+    def positions(self, hand: ShapedHand, pose: HandPose) -> Float[Tensor, "points 3"]:
+        """Where the points are in a pose: metres, world.
+
+        Args:
+            hand: rest hand, with the rig's vertices.
+            pose: one.
+        """
+        posed = hand.posed(pose)
+        bones = [0]
+        for finger in _FINGERS:
+            bones += [*FINGER_BONES[finger], NUM_BONES + _FINGERS.index(finger)]
+        joints = torch.cat([posed.joints, posed.vertices[self.tips]])
+        return torch.cat([joints[bones], posed.vertices[self.vertices]])

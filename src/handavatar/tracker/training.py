@@ -1,0 +1,233 @@
+"""Teaches the network what made pictures show."""
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+from torch.nn.functional import (
+    affine_grid,
+    binary_cross_entropy_with_logits,
+    cross_entropy,
+    grid_sample,
+)
+
+from handavatar.tracker.network import INPUT_SIDE, MAP_SIDE, HandNetwork, Told
+from handavatar.tracker.points import MIDDLE_KNUCKLE
+
+_MIRRORED = 0.12
+"""Of the pictures: they show a left hand, of which the network tells side and mask alone."""
+_PLACE_SCALE, _DEPTH_SCALE = 128.0, 20.0
+_WARM_STEPS, _LEAST_RATE, _SMOOTHING, _LONGEST_GRADIENT = 300, 0.005, 0.998, 5.0
+
+
+@dataclass(frozen=True)
+class TrackerOptions:
+    """How the network is taught."""
+
+    rate: float = 2e-3
+    """learning rate at its highest"""
+    batch: int = 64
+    """pictures a step"""
+    weight_decay: float = 1e-4
+    """of AdamW"""
+    turn: float = 0.35
+    """radians by which hands are not upright, one standard deviation"""
+    any_turn: float = 0.1
+    """share of pictures that are turned any way"""
+    sides: tuple[float, float] = (1.2, 1.75)
+    """least and greatest side of a picture, in units of its hand's box"""
+    shift: float = 0.08
+    """by which hands are beside the middle, in units of half the side, one standard deviation"""
+
+
+@dataclass(frozen=True, eq=False)
+class CropBatch:
+    """Pictures and what is true of them, as :class:`MadeCrops` has it."""
+
+    images: UInt8[Tensor, "crops side side 3"]
+    classes: UInt8[Tensor, "crops rows columns"]
+    points: Float[Tensor, "crops points 3"]
+    is_hand: Bool[Tensor, "crops"]
+
+
+def upright_turn(places: Float[Tensor, "crops points 2"]) -> Float[Tensor, "crops"]:
+    """Radians by which upright hands are turned into those of pictures: wrist below the knuckle.
+
+    Args:
+        places: landmarks and what follows them, right and down.
+    """
+    right, down = (places[:, MIDDLE_KNUCKLE] - places[:, 0]).unbind(-1)
+    return torch.atan2(right, -down)
+
+
+def vary_crops(
+    batch: CropBatch, options: TrackerOptions, generator: torch.Generator
+) -> tuple[
+    Float[Tensor, "crops 3 side side"],
+    Int[Tensor, "crops rows columns"],
+    Float[Tensor, "crops points 3"],
+    Bool[Tensor, "crops"],
+]:
+    """Brings hands upright into the middle, more or less, tints them, and mirrors a few of them.
+
+    Returns:
+        Pictures, classes at the maps' resolution, points, and whether the hand is a right one.
+    """
+    count = len(batch.images)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(count, *shape, generator=generator) * 2 - 1
+
+    corners = batch.points[..., :2] * 2 - 1
+    angle = upright_turn(batch.points[..., :2])
+    angle = angle + options.turn * torch.randn(count, generator=generator)
+    is_any = torch.rand(count, generator=generator) < options.any_turn
+    angle = torch.where(is_any, math.pi * uniform(), angle)
+    turn = torch.stack(
+        [torch.stack([angle.cos(), -angle.sin()], -1), torch.stack([angle.sin(), angle.cos()], -1)],
+        dim=1,
+    )
+    turned = corners @ turn
+    low, high = turned.amin(1), turned.amax(1)
+    least, most = options.sides
+    side = (high - low).amax(-1) / 2 * (least + (most - least) * (uniform() + 1) / 2)
+    middle = (low + high) / 2 + options.shift * side[:, None] * torch.randn(
+        count, 2, generator=generator
+    )
+    shift = (turn @ middle[..., None])[..., 0]
+    turn = turn * side[:, None, None]
+    is_right = torch.rand(count, generator=generator) > _MIRRORED
+    mirror = torch.ones(count, 2)
+    mirror[~is_right, 0] = -1
+    theta = torch.cat([turn * mirror[:, None], shift[..., None]], -1)
+    images = batch.images.permute(0, 3, 1, 2).float() / 255
+    grid = affine_grid(theta, [count, 3, INPUT_SIDE, INPUT_SIDE], align_corners=False)
+    images = grid_sample(images, grid, padding_mode="border", align_corners=False)
+    tint = 1 + 0.08 * torch.randn(count, 3, 1, 1, generator=generator)
+    images = (images * tint + 0.06 * torch.randn(count, 1, 1, 1, generator=generator)).clamp(0, 1)
+    small = affine_grid(theta, [count, 1, MAP_SIDE, MAP_SIDE], align_corners=False)
+    classes = grid_sample(
+        batch.classes[:, None].float(), small, mode="nearest", align_corners=False
+    )[:, 0].long()
+    where = corners - shift[:, None]
+    where = torch.linalg.solve(theta[:, None, :, :2], where[..., None])[..., 0]
+    points = torch.cat([(where + 1) / 2, batch.points[..., 2:]], dim=-1)
+    return images, classes, points, is_right
+
+
+def tracker_loss(
+    told: Told,
+    classes: Int[Tensor, "crops rows columns"],
+    points: Float[Tensor, "crops points 3"],
+    is_hand: Bool[Tensor, "crops"],
+    is_right: Bool[Tensor, "crops"],
+) -> Float[Tensor, ""]:
+    """Negative logarithm of the likelihood of points, mask, presence and side."""
+    counts = (is_hand & is_right).float()[:, None]
+    # A heat map has no place beyond its border.
+    inside = ((points[..., :2] > 0.01) & (points[..., :2] < 0.99)).all(-1).float() * counts
+    apart = (told.places - points[..., :2]).square().sum(-1)
+    sigma = told.place_errors
+    likelihood = 0.5 * apart / sigma.square() + 2 * (sigma * _PLACE_SCALE).log()
+    near = (apart * _PLACE_SCALE**2 + 1).sqrt() - 1
+    behind = (told.depths - points[..., 2]).square()
+    deep = told.depth_errors
+    depth_likelihood = 0.5 * behind / deep.square() + (deep * _DEPTH_SCALE).log()
+    depth_near = (behind * _DEPTH_SCALE**2 + 1).sqrt() - 1
+    total = (inside * (likelihood + 0.3 * near)).sum() / inside.sum().clamp_min(1)
+    number = counts.sum().clamp_min(1) * points.shape[1]
+    total = total + (counts * (depth_likelihood + 0.5 * depth_near)).sum() / number
+    total = total + 2 * cross_entropy(told.classes, classes)
+    total = total + binary_cross_entropy_with_logits(told.is_hand, is_hand.float())
+    side = binary_cross_entropy_with_logits(told.is_right, is_right.float(), reduction="none")
+    return total + (side * is_hand).sum() / is_hand.sum().clamp_min(1)
+
+
+class TrackerTraining:
+    """A network while it is taught, and the mean of its weights over the last steps.
+
+    Attributes:
+        step: number of steps done.
+    """
+
+    def __init__(
+        self, network: HandNetwork, options: TrackerOptions, steps: int, seed: int = 0
+    ) -> None:
+        """Begins.
+
+        Args:
+            network: to teach, in place, on its device.
+            options: rates.
+            steps: in all: the learning rate falls along a cosine.
+            seed: of how pictures are varied.
+        """
+        self.network, self.options, self.steps, self.step = network, options, steps, 0
+        self.generator = torch.Generator().manual_seed(seed)
+        self._optimizer = torch.optim.AdamW(
+            network.parameters(), options.rate, weight_decay=options.weight_decay
+        )
+        self._smooth = torch.optim.swa_utils.AveragedModel(
+            network,
+            multi_avg_fn=torch.optim.swa_utils.get_ema_multi_avg_fn(_SMOOTHING),
+            use_buffers=True,
+        )
+
+    def state(self) -> dict[str, object]:
+        """All that is needed to go on."""
+        return {
+            "network": self.network.state_dict(),
+            "smooth": self._smooth.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+            "step": self.step,
+            "steps": self.steps,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Goes on from a state; the number of steps in all stays as given here."""
+        self.network.load_state_dict(state["network"])
+        self._smooth.load_state_dict(state["smooth"])
+        self._optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"])
+        self.step = int(state["step"])
+
+    def teach(self, batch: CropBatch) -> float:
+        """One step.
+
+        Returns:
+            The loss before it.
+        """
+        self.network.train()
+        device = next(self.network.parameters()).device
+        done = self.step / self.steps
+        rate = self.options.rate * min(1.0, (self.step + 1) / _WARM_STEPS)
+        for group in self._optimizer.param_groups:
+            group["lr"] = rate * (0.5 + 0.5 * math.cos(math.pi * done) + _LEAST_RATE)
+        images, classes, points, is_right = vary_crops(batch, self.options, self.generator)
+        # In bfloat16, which a machine may have units for; sums are of 32 bits.
+        with torch.autocast(device.type, torch.bfloat16):
+            told = self.network(images.to(device))
+        loss = tracker_loss(
+            told,
+            classes.to(device),
+            points.to(device),
+            batch.is_hand.to(device),
+            is_right.to(device),
+        )
+        self._optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), _LONGEST_GRADIENT)
+        self._optimizer.step()
+        self._smooth.update_parameters(self.network)
+        self.step += 1
+        return float(loss.detach())
+
+    def taught(self) -> HandNetwork:
+        """The network with the mean of its last weights, which sees better than the last one."""
+        found = copy.deepcopy(self._smooth.module)
+        assert isinstance(found, HandNetwork)
+        return found.eval()
