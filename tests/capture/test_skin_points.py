@@ -1,9 +1,13 @@
 """What the tracker tells of crops, brought back to the picture."""
 
 import numpy as np
+import pytest
 import torch
 
-from handavatar.capture.skin_points import see_points
+from handavatar.capture.fitted_hand import HandFit
+from handavatar.capture.fitting import HAND_SIZE, Observations, with_skin
+from handavatar.capture.registration import see_landmarks
+from handavatar.capture.skin_points import SeenPoints, see_points
 from handavatar.capture.windows import window_around
 from handavatar.hand.rig import Rig
 from handavatar.tracker.model import TrainedTracker
@@ -45,3 +49,72 @@ def test_turned_and_scaled_looks_agree_in_the_picture(rig: Rig) -> None:
         # Crops are 1.35 to 1.55 times as long as the upright hand of 326 pixels.
         assert ((seen.errors > 4.0 * scale) & (seen.errors < 5.5 * scale)).all()
         assert np.allclose(seen.depths, 0.5) and np.allclose(seen.depth_errors, 0.1)
+
+
+def _seen(places: torch.Tensor, unsure: float) -> Observations:
+    frames = len(places)
+    return Observations(
+        landmarks=places[:, :21],
+        uncertainty=torch.full((frames, 21), unsure),
+        world_landmarks=torch.zeros(frames, 21, 3),
+        scale=torch.full((frames,), 1000.0),
+        times=torch.arange(frames) / 10,
+        picture_size=(640, 480),
+    )
+
+
+def test_two_trackers_are_surer_where_they_agree_and_less_sure_where_they_do_not() -> None:
+    generator = torch.Generator().manual_seed(0)
+    places = 100 + 200 * torch.rand(3, 24, 2, generator=generator)
+    depths = torch.rand(3, 24, generator=generator)
+    own = places.clone()
+    own[1, 7] += torch.tensor([40.0, 0.0])
+    points = [
+        SeenPoints(
+            place.double().numpy(),
+            np.full(24, 3.0),
+            depth.double().numpy(),
+            np.full(24, 0.1),
+        )
+        for place, depth in zip(own, depths, strict=True)
+    ]
+    both = with_skin(_seen(places, 2.0), points, torch.tensor([4, 5, 6]))
+    assert both.skin is not None and both.skin.vertices.tolist() == [4, 5, 6]
+    # 2 and 4 pixels (millimetres) here, 3 and 2 there.
+    other, mine = 2**2 + 4**2, 3**2 + 2**2
+    least = (1 / (1 / other + 1 / mine)) ** 0.5
+    error = both.skin.errors[:, :21]
+    assert torch.allclose(error[0], torch.tensor(least), rtol=1e-5)
+    torch.testing.assert_close(both.landmarks[0], places[0, :21])
+    share = other / (other + mine)
+    expected = places[1, 7] + share * torch.tensor([40.0, 0.0])
+    torch.testing.assert_close(both.landmarks[1, 7], expected)
+    # As far as the mixture of both is wide, each way on average.
+    wide = (least**2 + share * (1 - share) * 40**2 / 2) ** 0.5
+    assert float(error[1, 7]) == pytest.approx(wide, rel=1e-5)
+    # Skin is our own's alone, and so are depths, which come in metres.
+    torch.testing.assert_close(both.skin.places[:, 21:], places[:, 21:])
+    assert torch.allclose(both.skin.errors[:, 21:], torch.tensor(mine**0.5))
+    torch.testing.assert_close(both.skin.depths, HAND_SIZE * depths)
+    torch.testing.assert_close(both.world_landmarks[..., 2], HAND_SIZE * depths[:, :21])
+
+
+def test_captures_keep_what_both_saw() -> None:
+    places = 100 + 200 * torch.rand(2, 23, 2, generator=torch.Generator().manual_seed(1))
+    points = [
+        SeenPoints(place.double().numpy(), np.full(23, 3.0), np.zeros(23), np.full(23, 0.1))
+        for place in places
+    ]
+    seen = with_skin(_seen(places, 2.0), points, torch.tensor([4, 5]))
+    fit = HandFit(
+        torch.zeros(2, 16, 3),
+        torch.zeros(2, 3),
+        torch.zeros(10),
+        torch.tensor(500.0).log(),
+        torch.zeros(21, 3),
+    )
+    for frame, sighting in enumerate(see_landmarks(seen, fit)):
+        assert sighting.vertices.tolist() == [4, 5] and sighting.depths.shape == (23,)
+        pixels = sighting.directions * 500 + torch.tensor([320.0, 240.0])
+        torch.testing.assert_close(pixels, places[frame], rtol=0, atol=1e-3)
+        assert float(sighting.depths.mean()) == pytest.approx(0.0, abs=1e-7)

@@ -112,7 +112,7 @@ class Observations:
 
 
 HAND_SIZE = 0.093
-"""Metres from the wrist's joint to the middle finger's knuckle: the unit of our tracker's depths."""
+"""Metres from the wrist's joint to the middle finger's knuckle: the unit of tracked depths."""
 OWN_ERROR = 0.002
 """Metres by which points of our own tracker are off in the picture, beside what it admits."""
 OWN_DEPTH_ERROR = 0.004

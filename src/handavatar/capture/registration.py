@@ -11,9 +11,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from handavatar.capture.checks import CaptureError
 from handavatar.capture.fitted_hand import HandFit
 from handavatar.capture.fitting import LANDMARK_ERROR, Observations
-from handavatar.capture.frames import FITTED_SIDE, Capture, Frame
+from handavatar.capture.frames import FITTED_SIDE, LANDMARKS, Capture, Frame
 from handavatar.capture.masks import HandMask, mask_coverage
 from handavatar.capture.tracking import TrackedHand
 from handavatar.capture.windows import window_camera
@@ -207,7 +208,18 @@ def register_frames(
         options: expected errors, rounds.
         learns_shape: whether the hand's shape moves.
         progress: told how far it is.
+
+    Raises:
+        CaptureError: if the skin that a tracker saw is another rig's.
     """
+    for frame in frames:
+        seen = frame.landmarks
+        if seen is not None and bool((seen.vertices >= hands[0].rig.num_vertices).any()):
+            raise CaptureError(
+                f"{LANDMARKS}: vertex {int(seen.vertices.max())} is not one of the rig's "
+                f"{hands[0].rig.num_vertices}",
+                "make the capture again",
+            )
     covariances = [frame.covariance for frame in frames if frame.covariance is not None]
     information = None
     if len(covariances) == len(frames):

@@ -119,9 +119,9 @@ class VideoOptions:
     """Stop after this many pictures."""
     side: Literal["auto", "left", "right"] = "auto"
     """Which hand it is; auto takes the video as not mirrored."""
-    tracker: Literal["mediapipe", "both"] = "mediapipe"
-    """Who tells where landmarks are: mediapipe alone, or our own tracker too, once that has found
-    the hand."""
+    tracker: Literal["mediapipe", "both"] = "both"
+    """Who tells where landmarks are: mediapipe alone, or both it and our own tracker, which also
+    tells points of the skin and looks where mediapipe has found the hand."""
     size: int | None = None
     """Side of the stored pictures, pixels; by default 512 where hands are as large, else 256."""
     min_confidence: float = 0.5

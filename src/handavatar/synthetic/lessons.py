@@ -20,7 +20,12 @@ from handavatar.tracker.measures import TrackerFigures, measure_tracker
 from handavatar.tracker.model import TrainedTracker, read_tracker, save_tracker, shipped_tracker
 from handavatar.tracker.network import HandNetwork
 from handavatar.tracker.points import TrackedPoints
-from handavatar.tracker.training import CropBatch, TrackerOptions, TrackerTraining
+from handavatar.tracker.training import (
+    CropBatch,
+    TrackerOptions,
+    TrackerTraining,
+    vary_crops,
+)
 
 RIG = "open-hand"
 NUM_SKIN_POINTS = 64
@@ -28,6 +33,8 @@ IN_A_FILE = 1000
 """Pictures of a file."""
 _JUDGED_FROM = 1_000_000
 """Seeds from here on are never taught with."""
+_IN_USE = TrackerOptions(turn=0.2, any_turn=0.0, sides=(1.3, 1.6), shift=0.05, mirrored=0.0)
+"""How hands lie in crops that are cut about where they were seen before."""
 Report = Callable[[str, int, int, float], None]
 """Told what is being done, how much of it, of how much, and the loss."""
 
@@ -70,7 +77,7 @@ def train_made_tracker(
     """Makes what pictures are missing, teaches a network, writes it.
 
     Raises:
-        CaptureError: nothing to go on with, or a damaged file of pictures.
+        CaptureError: nothing to go on with, or a damaged file.
     """
     tell = report or (lambda doing, done, total, loss: None)
     state_file = options.out.with_suffix(".state")
@@ -85,7 +92,12 @@ def train_made_tracker(
     network = HandNetwork(len(points)).to(options.device)
     training = TrackerTraining(network, TrackerOptions(), options.steps, options.seed)
     if options.resume:
-        training.restore(torch.load(state_file, weights_only=True))
+        try:
+            training.restore(load_file(state_file))
+        except (OSError, SafetensorError, KeyError, RuntimeError) as error:
+            raise CaptureError(
+                f"{state_file} cannot be gone on with ({error})", "train without --resume"
+            ) from error
     lessons = draw_lessons(read_pictures(files), training)
     saved = time.monotonic()
     for batch in lessons:
@@ -123,7 +135,10 @@ def evaluate_made_tracker(options: TrackerEvaluateOptions) -> TrackerFigures:
             for name in ("images", "classes", "points", "is_hand")
         }
     )
-    return measure_tracker(tracker, batch)
+    images, classes, points, _ = vary_crops(batch, _IN_USE, torch.Generator().manual_seed(0))
+    pixels = (255 * images).round().to(torch.uint8).permute(0, 2, 3, 1)
+    seen = CropBatch(pixels, classes.to(torch.uint8), points, batch.is_hand)
+    return measure_tracker(tracker, seen)
 
 
 def draw_lessons(pictures: CropBatch, training: TrackerTraining) -> Iterator[CropBatch]:
@@ -199,5 +214,5 @@ def read_pictures(files: list[Path]) -> CropBatch:
 
 def _save_aside(path: Path, training: TrackerTraining) -> None:
     aside = path.with_suffix(f".{os.getpid()}")
-    torch.save(training.state(), aside)
+    save_file(training.state(), aside)
     aside.replace(path)

@@ -3,7 +3,6 @@
 import copy
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -18,8 +17,6 @@ from torch.nn.functional import (
 from handavatar.tracker.network import INPUT_SIDE, MAP_SIDE, HandNetwork, Told
 from handavatar.tracker.points import MIDDLE_KNUCKLE
 
-_MIRRORED = 0.12
-"""Of the pictures: they show a left hand, of which the network tells side and mask alone."""
 _PLACE_SCALE, _DEPTH_SCALE = 128.0, 20.0
 _WARM_STEPS, _LEAST_RATE, _SMOOTHING, _LONGEST_GRADIENT = 300, 0.005, 0.998, 5.0
 
@@ -40,6 +37,8 @@ class TrackerOptions:
     """share of pictures that are turned any way"""
     sides: tuple[float, float] = (1.2, 1.75)
     """least and greatest side of a picture, in units of its hand's box"""
+    mirrored: float = 0.12
+    """share that shows a left hand, of which the network tells side and mask alone"""
     shift: float = 0.08
     """by which hands are beside the middle, in units of half the side, one standard deviation"""
 
@@ -100,7 +99,7 @@ def vary_crops(
     )
     shift = (turn @ middle[..., None])[..., 0]
     turn = turn * side[:, None, None]
-    is_right = torch.rand(count, generator=generator) > _MIRRORED
+    is_right = torch.rand(count, generator=generator) > options.mirrored
     mirror = torch.ones(count, 2)
     mirror[~is_right, 0] = -1
     theta = torch.cat([turn * mirror[:, None], shift[..., None]], -1)
@@ -176,22 +175,35 @@ class TrackerTraining:
             use_buffers=True,
         )
 
-    def state(self) -> dict[str, object]:
-        """All that is needed to go on."""
-        return {
-            "network": self.network.state_dict(),
-            "smooth": self._smooth.state_dict(),
-            "optimizer": self._optimizer.state_dict(),
-            "generator": self.generator.get_state(),
-            "step": self.step,
-            "steps": self.steps,
-        }
+    def state(self) -> dict[str, Tensor]:
+        """All that is needed to go on, as tensors by name."""
+        found = {f"network.{name}": value for name, value in self.network.state_dict().items()}
+        found |= {f"smooth.{name}": value for name, value in self._smooth.state_dict().items()}
+        for number, values in self._optimizer.state_dict()["state"].items():
+            found |= {f"optimizer.{number}.{name}": value for name, value in values.items()}
+        found["generator"] = self.generator.get_state()
+        found["step"] = torch.tensor(self.step)
+        return {name: value.detach().cpu().clone().contiguous() for name, value in found.items()}
 
-    def restore(self, state: dict[str, Any]) -> None:
-        """Goes on from a state; the number of steps in all stays as given here."""
-        self.network.load_state_dict(state["network"])
-        self._smooth.load_state_dict(state["smooth"])
-        self._optimizer.load_state_dict(state["optimizer"])
+    def restore(self, state: dict[str, Tensor]) -> None:
+        """Goes on from a state; the number of steps in all stays as given here.
+
+        Raises:
+            KeyError, RuntimeError: if it is the state of another network.
+        """
+
+        def part(prefix: str) -> dict[str, Tensor]:
+            size = len(prefix) + 1
+            return {n[size:]: v for n, v in state.items() if n.startswith(f"{prefix}.")}
+
+        self.network.load_state_dict(part("network"))
+        self._smooth.load_state_dict(part("smooth"))
+        held: dict[int, dict[str, Tensor]] = {}
+        for name, value in part("optimizer").items():
+            number, _, key = name.partition(".")
+            held.setdefault(int(number), {})[key] = value
+        groups = self._optimizer.state_dict()["param_groups"]
+        self._optimizer.load_state_dict({"state": held, "param_groups": groups})
         self.generator.set_state(state["generator"])
         self.step = int(state["step"])
 

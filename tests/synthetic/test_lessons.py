@@ -1,0 +1,65 @@
+"""The tracker's training as a command: pictures on disk, going on, what is refused."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from handavatar.capture.checks import CaptureError
+from handavatar.synthetic import lessons
+from handavatar.synthetic.lessons import TrackerTrainOptions, train_made_tracker
+from handavatar.tracker.model import read_tracker
+
+
+@pytest.fixture
+def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TrackerTrainOptions:
+    monkeypatch.setattr(lessons, "IN_A_FILE", 70)
+    return TrackerTrainOptions(
+        tmp_path / "t.safetensors", tmp_path / "pictures", count=70, steps=4, processes=1
+    )
+
+
+def test_a_training_makes_its_pictures_once_and_goes_on(
+    options: TrackerTrainOptions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # In this process: a spawned one would not know of the smaller files.
+    monkeypatch.setattr(lessons, "ProcessPoolExecutor", lambda *_: _Here())
+    told: list[tuple[str, int, int]] = []
+
+    def report(doing: str, done: int, total: int, loss: float) -> None:
+        told.append((doing, done, total))
+
+    with pytest.raises(CaptureError, match="nothing to go on with"):
+        train_made_tracker(replace(options, resume=True), report)
+    train_made_tracker(options, report)
+    assert told[:2] == [("pictures", 0, 1), ("pictures", 1, 1)] and told[-1] == ("training", 4, 4)
+    first = read_tracker(options.out)
+    made = next(options.pictures.iterdir())
+    written = made.stat().st_mtime_ns
+    told.clear()
+    train_made_tracker(replace(options, resume=True, steps=6), report)
+    assert told == [("pictures", 1, 1), ("training", 5, 6), ("training", 6, 6)]
+    assert made.stat().st_mtime_ns == written
+    second = read_tracker(options.out)
+    assert torch.equal(first.points.vertices, second.points.vertices)
+    assert not torch.equal(first.network.at_point, second.network.at_point)
+    options.out.with_suffix(".state").write_bytes(b"nothing")
+    with pytest.raises(CaptureError, match="cannot be gone on with"):
+        train_made_tracker(replace(options, resume=True))
+    made.write_bytes(b"nothing")
+    with pytest.raises(CaptureError, match="cannot be read"):
+        train_made_tracker(options)
+    assert torch.equal(read_tracker(options.out).network.at_point, second.network.at_point)
+
+
+class _Here:
+    """As a pool of processes, in this one."""
+
+    map = staticmethod(map)
+
+    def __enter__(self) -> "_Here":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
