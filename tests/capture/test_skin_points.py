@@ -78,10 +78,10 @@ def test_two_trackers_are_surer_where_they_agree_and_less_sure_where_they_do_not
         )
         for place, depth in zip(own, depths, strict=True)
     ]
-    both = with_skin(_seen(places, 2.0), points, torch.tensor([4, 5, 6]))
+    both = with_skin(_seen(places, 2.0), points, torch.tensor([4, 5, 6]), torch.tensor([7, 8, 0]))
     assert both.skin is not None and both.skin.vertices.tolist() == [4, 5, 6]
-    # 2 and 4 pixels (millimetres) here, 3 and 2 there.
-    other, mine = 2**2 + 4**2, 3**2 + 2**2
+    # 2 and 4 pixels (millimetres) here, 3 and 4 there.
+    other, mine = 2**2 + 4**2, 3**2 + 4**2
     least = (1 / (1 / other + 1 / mine)) ** 0.5
     error = both.skin.errors[:, :21]
     assert torch.allclose(error[0], torch.tensor(least), rtol=1e-5)
@@ -94,7 +94,13 @@ def test_two_trackers_are_surer_where_they_agree_and_less_sure_where_they_do_not
     assert float(error[1, 7]) == pytest.approx(wide, rel=1e-5)
     # Skin is our own's alone, and so are depths, which come in metres.
     torch.testing.assert_close(both.skin.places[:, 21:], places[:, 21:])
-    assert torch.allclose(both.skin.errors[:, 21:], torch.tensor(mine**0.5))
+    assert torch.allclose(both.skin.errors[0, 21:], torch.tensor(mine**0.5))
+    # Skin near a landmark that the other tracker sees elsewhere is as unsure, in depth as well.
+    factor = (40**2 / 2 / (other + mine)) ** 0.5
+    expected_errors = mine**0.5 * torch.tensor([factor, 1, 1])
+    assert torch.allclose(both.skin.errors[1, 21:], expected_errors, rtol=1e-4)
+    depth_ratio = both.skin.depth_errors[1, [7, 21, 22]] / both.skin.depth_errors[0, [7, 21, 22]]
+    assert torch.allclose(depth_ratio, torch.tensor([factor, factor, 1]), rtol=1e-4)
     torch.testing.assert_close(both.skin.depths, HAND_SIZE * depths)
     torch.testing.assert_close(both.world_landmarks[..., 2], HAND_SIZE * depths[:, :21])
 
@@ -105,7 +111,7 @@ def test_captures_keep_what_both_saw() -> None:
         SeenPoints(place.double().numpy(), np.full(23, 3.0), np.zeros(23), np.full(23, 0.1))
         for place in places
     ]
-    seen = with_skin(_seen(places, 2.0), points, torch.tensor([4, 5]))
+    seen = with_skin(_seen(places, 2.0), points, torch.tensor([4, 5]), torch.tensor([0, 1]))
     fit = HandFit(
         torch.zeros(2, 16, 3),
         torch.zeros(2, 3),

@@ -115,6 +115,9 @@ def test_the_slope_of_landmarks_is_exact(rig: Rig, skin: tuple[int, ...]) -> Non
     slopes = _slopes(points, pose, seen, options, SEEN_WELL, 1e-3)
     # Energies of some hundreds in float32, over steps of 1e-3.
     torch.testing.assert_close(2 * found.gradient[SEEN_WELL], slopes, rtol=2e-2, atol=2.0)
+    if skin:
+        # Points of the skin tell nothing about the shape.
+        return
     # And in the shared unknowns: shape, and each landmark's own offset.
     for unknown in (0, 3, 9, 12, 20, 50, 74):
         ends = []
@@ -122,7 +125,7 @@ def test_the_slope_of_landmarks_is_exact(rig: Rig, skin: tuple[int, ...]) -> Non
             shared = torch.zeros(75)
             shared[unknown] = sign * (1e-2 if unknown < 10 else 1e-4)
             hand = points.space.shaped(points.hand, shared[:12])
-            rest = landmark_rest(hand, points.space, shared[12:], vertices)
+            rest = landmark_rest(hand, points.space, shared[12:])
             at = replace(points, hand=hand, landmarks=rest)
             ends.append(_linearised(at, pose, seen, options).energy)
         slope = (ends[0] - ends[1]) / (2 * abs(float(shared[unknown])))

@@ -62,6 +62,8 @@ def test_points_lie_where_the_fit_has_its_landmarks(rig: Rig) -> None:
     expected = HandModel(rig).landmarks(fit)[0]
     torch.testing.assert_close(found[:NUM_LANDMARKS], expected, rtol=0, atol=1e-6)
     assert len(points) == len(found) == 61
+    nearest = points.nearest_landmarks(rig)
+    assert nearest.shape == (40,) and set(nearest.tolist()) >= {0, 1, 5, 9, 13, 17}
     assert len(set(points.vertices.tolist()) | set(points.tips.tolist())) == 45
 
 

@@ -113,14 +113,36 @@ class Observations:
 
 HAND_SIZE = 0.093
 """Metres from the wrist's joint to the middle finger's knuckle: the unit of tracked depths."""
-OWN_ERROR = 0.002
+OWN_ERROR = 0.004
 """Metres by which points of our own tracker are off in the picture, beside what it admits."""
 OWN_DEPTH_ERROR = 0.004
 """Metres by which their depths are off, beside what it admits."""
 
 
+def contradiction(
+    apart: Float[Tensor, "frames points 2"],
+    own: Float[Tensor, "frames points"],
+    other: Float[Tensor, "frames points"],
+) -> Float[Tensor, "frames points"]:
+    """By what factor our tracker seems further off than it says, at least 1.
+
+    It was taught by made pictures; where real ones are unlike those, nobody tells it but another
+    tracker that sees the hand elsewhere.
+
+    Args:
+        apart: of the two trackers' landmarks, pixels.
+        own: errors that our tracker admits, of each coordinate, pixels.
+        other: those of the other one.
+    """
+    squared = apart.square().mean(-1) / (own.square() + other.square())
+    return squared.clamp_min(1.0).sqrt()
+
+
 def with_skin(
-    seen: Observations, points: Sequence[SeenPoints], vertices: Int[Tensor, "skin"]
+    seen: Observations,
+    points: Sequence[SeenPoints],
+    vertices: Int[Tensor, "skin"],
+    nearest: Int[Tensor, "skin"],
 ) -> Observations:
     """Landmarks of both trackers in one, each as far as it is sure, and our own's skin and depths.
 
@@ -128,6 +150,7 @@ def with_skin(
         seen: by the other tracker.
         points: by our own, in the same frames.
         vertices: of the rig, which points behind the landmarks are; of another rig none.
+        nearest: landmark of each of them: where that is contradicted, so is the skin.
     """
 
     def stacked(name: str) -> Tensor:
@@ -135,17 +158,21 @@ def with_skin(
         return values[:, : seen.landmarks.shape[1] + len(vertices)]
 
     count, scale = seen.landmarks.shape[1], seen.scale[:, None]
-    places, errors = stacked("places"), stacked("errors").hypot(OWN_ERROR * scale)
-    depths = HAND_SIZE * stacked("depths")
-    depth_errors = (HAND_SIZE * stacked("depth_errors")).hypot(torch.tensor(OWN_DEPTH_ERROR))
+    places, depths = stacked("places"), HAND_SIZE * stacked("depths")
     other = seen.uncertainty.hypot(LANDMARK_ERROR * scale)
+    errors = stacked("errors").hypot(OWN_ERROR * scale)
+    apart = places[:, :count] - seen.landmarks
+    factors = contradiction(apart, errors[:, :count], other)
+    factors = torch.cat([factors, factors[:, nearest]], dim=1)
+    depth_errors = factors * (HAND_SIZE * stacked("depth_errors")).hypot(
+        torch.tensor(OWN_DEPTH_ERROR)
+    )
     own = errors[:, :count]
     share = (own**-2 / (own**-2 + other**-2))[..., None]
     both = share * places[:, :count] + (1 - share) * seen.landmarks
-    apart = (places[:, :count] - seen.landmarks).square().mean(-1)
     # Where they contradict each other one of them is wrong, and nobody knows which.
-    contradiction = (share * (1 - share))[..., 0] * apart
-    error = (1 / (own**-2 + other**-2) + contradiction).sqrt()
+    wide = (share * (1 - share))[..., 0] * apart.square().mean(-1)
+    error = (1 / (own**-2 + other**-2) + wide).sqrt()
     across = (both - both.mean(1, keepdim=True)) / scale[..., None]
     return replace(
         seen,
@@ -155,7 +182,7 @@ def with_skin(
         skin=SkinObservations(
             vertices,
             torch.cat([both, places[:, count:]], dim=1),
-            torch.cat([error, errors[:, count:]], dim=1),
+            torch.cat([error, (factors * errors)[:, count:]], dim=1),
             depths,
             depth_errors,
         ),
@@ -216,6 +243,23 @@ def fit_hands(
         )
         fit = retried(model, observations, fit, options, find_pairs)
     return fit
+
+
+def fit_poses(rig: Rig, observations: Observations, fit: HandFit, options: FitOptions) -> HandFit:
+    """Poses of every frame by landmarks, anew, of a hand whose shape is known.
+
+    Args:
+        rig: any rig with fingertips.
+        observations: of one right hand.
+        fit: whose shape, focal length and offsets stay.
+        options: expected errors, steps.
+    """
+    model = HandModel(rig)
+    begin = initial_fit(model, observations, options)
+    begin = replace(fit, rotations=begin.rotations, translation=begin.translation)
+    begin = placed(model, observations, begin)
+    steps = options.landmark_steps
+    return refined(model, observations, begin, options, steps=steps, learns_shape=False)
 
 
 def retried(

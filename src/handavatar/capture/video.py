@@ -23,6 +23,7 @@ from handavatar.capture.fitting import (
     FitOptions,
     Observations,
     fit_hands,
+    fit_poses,
     landmark_errors,
     with_skin,
 )
@@ -418,11 +419,21 @@ def _on_all_cores(
 
 def observations_of(track: Track) -> Observations:
     """What the trackers saw, as tensors."""
+    seen = _seen_by_mediapipe(track)
+    points = [hand.points for hand in track.hands if hand.points is not None]
+    if len(points) < len(track.hands):
+        return seen
+    tracked = shipped_tracker().points
+    num_skin = len(points[0].places) - NUM_LANDMARKS
+    nearest = tracked.nearest_landmarks(load_rig(tracked.rig_name))[:num_skin]
+    return with_skin(seen, points, tracked.vertices[:num_skin], nearest)
 
+
+def _seen_by_mediapipe(track: Track) -> Observations:
     def stacked(values: list[object]) -> Tensor:
         return torch.from_numpy(np.array(values)).float()
 
-    seen = Observations(
+    return Observations(
         landmarks=stacked([hand.landmarks for hand in track.hands]),
         uncertainty=stacked([hand.spread for hand in track.hands]),
         world_landmarks=stacked([hand.world_landmarks for hand in track.hands]),
@@ -430,11 +441,6 @@ def observations_of(track: Track) -> Observations:
         times=stacked([hand.time for hand in track.hands]),
         picture_size=track.picture_size,
     )
-    points = [hand.points for hand in track.hands if hand.points is not None]
-    if len(points) < len(track.hands):
-        return seen
-    num_skin = len(points[0].places) - NUM_LANDMARKS
-    return with_skin(seen, points, shipped_tracker().points.vertices[:num_skin])
 
 
 def see_skin(track: Track, rig: Rig) -> Track:
@@ -459,7 +465,10 @@ def see_skin(track: Track, rig: Rig) -> Track:
 def _fitted_to_landmarks(track: Track, rig: Rig, options: VideoOptions) -> FittedHands:
     """Where the landmarks alone have the hand, with its shape and the focal length."""
     observations = observations_of(track)
-    fit = fit_hands(rig, observations, options.fit)
+    # What made pictures teach about a hand's shape is the shape of made hands.
+    fit = fit_hands(rig, _seen_by_mediapipe(track), options.fit)
+    if observations.skin is not None:
+        fit = fit_poses(rig, observations, fit, options.fit)
     vertices = HandModel(rig).all_vertices(fit)
     return _judged_fit(rig, observations, fit, vertices, torch.zeros(len(vertices), 51, 51))
 

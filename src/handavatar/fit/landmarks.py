@@ -73,10 +73,12 @@ def landmark_rest(
     places = places + offsets.reshape(21, 3)
     directions = torch.cat([moving, own], dim=-1)
     if vertices is not None and len(vertices):
-        still = own.new_zeros(len(vertices), 3, NUM_OFFSETS)
         places = torch.cat([places, hand.rest_vertices[vertices]])
         weights = torch.cat([weights, hand.rig.skin_weights[vertices]])
-        directions = torch.cat([directions, torch.cat([space.directions[vertices], still], dim=-1)])
+        # What a tracker errs by is much the same in all frames, and would be taken for shape:
+        # joints have offsets that tell the two apart, points of the skin tell of poses alone.
+        still = directions.new_zeros(len(vertices), 3, directions.shape[-1])
+        directions = torch.cat([directions, still])
     return RestPoints(places, weights, directions)
 
 

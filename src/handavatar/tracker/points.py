@@ -52,6 +52,14 @@ class TrackedPoints:
         """Whether they are points of a rig, so that its skin may be told, and not joints alone."""
         return rig.sha256 == self.rig_sha256
 
+    def nearest_landmarks(self, rig: Rig) -> Int[Tensor, "skin"]:
+        """The landmark that each point of the skin lies nearest to, on the template hand."""
+        pose = HandPose(torch.zeros(NUM_BONES, 3), torch.zeros(3))
+        shape = torch.zeros(rig.shape_directions.shape[-1])
+        places = self.positions(rig.shaped(shape), pose)
+        landmarks, skin = places[:NUM_LANDMARKS], places[NUM_LANDMARKS:]
+        return (skin[:, None] - landmarks).norm(dim=-1).argmin(1)
+
     def __len__(self) -> int:
         """Number of points, landmarks included."""
         return NUM_LANDMARKS + len(self.vertices)
