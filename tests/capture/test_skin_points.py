@@ -83,7 +83,7 @@ def test_two_trackers_are_surer_where_they_agree_and_less_sure_where_they_do_not
     # 2 and 4 pixels (millimetres) here, 3 and 4 there.
     other, mine = 2**2 + 4**2, 3**2 + 4**2
     least = (1 / (1 / other + 1 / mine)) ** 0.5
-    error = both.skin.errors[:, :21]
+    error = both.uncertainty
     assert torch.allclose(error[0], torch.tensor(least), rtol=1e-5)
     torch.testing.assert_close(both.landmarks[0], places[0, :21])
     share = other / (other + mine)
@@ -93,12 +93,12 @@ def test_two_trackers_are_surer_where_they_agree_and_less_sure_where_they_do_not
     wide = (least**2 + share * (1 - share) * 40**2 / 2) ** 0.5
     assert float(error[1, 7]) == pytest.approx(wide, rel=1e-5)
     # Skin is our own's alone, and so are depths, which come in metres.
-    torch.testing.assert_close(both.skin.places[:, 21:], places[:, 21:])
-    assert torch.allclose(both.skin.errors[0, 21:], torch.tensor(mine**0.5))
+    torch.testing.assert_close(both.skin.places, places[:, 21:])
+    assert torch.allclose(both.skin.errors[0], torch.tensor(mine**0.5))
     # Skin near a landmark that the other tracker sees elsewhere is as unsure, in depth as well.
     factor = (40**2 / 2 / (other + mine)) ** 0.5
     expected_errors = mine**0.5 * torch.tensor([factor, 1, 1])
-    assert torch.allclose(both.skin.errors[1, 21:], expected_errors, rtol=1e-4)
+    assert torch.allclose(both.skin.errors[1], expected_errors, rtol=1e-4)
     depth_ratio = both.skin.depth_errors[1, [7, 21, 22]] / both.skin.depth_errors[0, [7, 21, 22]]
     assert torch.allclose(depth_ratio, torch.tensor([factor, factor, 1]), rtol=1e-4)
     torch.testing.assert_close(both.skin.depths, HAND_SIZE * depths)
@@ -124,3 +124,18 @@ def test_captures_keep_what_both_saw() -> None:
         pixels = sighting.directions * 500 + torch.tensor([320.0, 240.0])
         torch.testing.assert_close(pixels, places[frame], rtol=0, atol=1e-3)
         assert float(sighting.depths.mean()) == pytest.approx(0.0, abs=1e-7)
+
+
+def test_some_frames_of_what_both_saw_keep_their_skin() -> None:
+    places = 100 + 200 * torch.rand(3, 23, 2, generator=torch.Generator().manual_seed(2))
+    points = [
+        SeenPoints(
+            place.double().numpy(), np.full(23, 3.0), np.full(23, float(depth)), np.full(23, 0.1)
+        )
+        for depth, place in enumerate(places)
+    ]
+    seen = with_skin(_seen(places, 2.0), points, torch.tensor([4, 5]), torch.tensor([0, 1]))
+    some = seen.chosen(torch.tensor([2, 0, 2]))
+    assert some.skin is not None and some.skin.vertices.tolist() == [4, 5]
+    torch.testing.assert_close(some.skin.places, places[[2, 0, 2], 21:])
+    torch.testing.assert_close(some.skin.depths[:, 0], HAND_SIZE * torch.tensor([2.0, 0.0, 2.0]))

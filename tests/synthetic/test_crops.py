@@ -3,9 +3,11 @@
 import numpy as np
 import pytest
 
+from handavatar.hand.landmarks import NUM_LANDMARKS
 from handavatar.hand.rig import Rig
-from handavatar.synthetic.crops import CROP_SIDE, FOREARM, HAND, MadeCrops, make_crops
-from handavatar.tracker.points import NUM_LANDMARKS, TrackedPoints
+from handavatar.synthetic.crops import CROP_SIDE, MadeCrops, make_crops
+from handavatar.tracker.network import FOREARM, HAND
+from handavatar.tracker.points import TrackedPoints
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from safetensors.torch import save_file
 from torch.nn.functional import interpolate
 
 from handavatar.capture.fitted_hand import HandFit, HandModel
+from handavatar.hand.landmarks import NUM_LANDMARKS
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
@@ -23,7 +24,7 @@ from handavatar.tracker.model import (
     shipped_tracker,
 )
 from handavatar.tracker.network import INPUT_SIDE, MAP_SIDE, HandNetwork, Told
-from handavatar.tracker.points import NUM_LANDMARKS, TrackedPoints
+from handavatar.tracker.points import TrackedPoints
 from handavatar.tracker.training import CropBatch, TrackerOptions, TrackerTraining, vary_crops
 
 POINTS = NUM_LANDMARKS + 3

@@ -494,10 +494,8 @@ def judge_film(truth: FilmTruth, clip: FoundClip, tried: int) -> ClipScores:
 
 def true_hands(truth: FilmTruth, pictures: list[int]) -> Hands:
     """The hands of some pictures of a film."""
-    rest = truth.rig.shaped(truth.shape_coefficients)
-    rest = replace(rest, rest_vertices=truth.rest_vertices)
     views = torch.eye(4).expand(len(pictures), 4, 4)
-    return hands_in_view(rest, [truth.pose(picture) for picture in pictures], views)
+    return hands_in_view(truth.rest_hand, [truth.pose(picture) for picture in pictures], views)
 
 
 # ------------------------------------------------------------------------------------------ parts

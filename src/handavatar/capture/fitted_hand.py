@@ -10,16 +10,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from handavatar.hand.landmarks import LANDMARK_BONES, LANDMARK_ROWS
 from handavatar.hand.pose import (
-    FINGER_BONES,
     NUM_BONES,
     HandPose,
     bone_transforms,
     linear_blend_skinning,
 )
 from handavatar.hand.rig import Rig
-
-_FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +65,8 @@ class HandModel:
         """
         self.rig = rig
         tips = rig.vertex_sets["fingertips"]
-        bones, rows = [0], [0]
-        for finger, _ in zip(_FINGERS, tips, strict=True):
-            chain = FINGER_BONES[finger]
-            bones += [*chain, chain[-1]]
-            rows += [*chain, NUM_BONES + _FINGERS.index(finger)]
-        self.landmark_bones = torch.tensor(bones)
+        rows = list(LANDMARK_ROWS)
+        self.landmark_bones = torch.tensor(LANDMARK_BONES)
         self._tip_landmarks = torch.tensor(
             [rows.index(NUM_BONES + finger) for finger in range(len(tips))]
         )

@@ -60,21 +60,31 @@ class FitOptions:
 
 @dataclass(frozen=True, eq=False)
 class SkinObservations:
-    """Landmarks and points of the skin, as our own tracker sees them.
+    """What our own tracker sees beside where landmarks are: skin, and the depth of all points.
 
     Attributes:
         vertices: of the rig: which points of the skin follow the landmarks.
-        places: pixels of the picture.
+        places: of the skin, pixels of the picture.
         errors: expected, of each coordinate, pixels.
-        depths: behind the wrist, metres.
+        depths: of the landmarks and then of the skin, behind the wrist, metres.
         depth_errors: expected, metres.
     """
 
     vertices: Int[Tensor, "skin"]
-    places: Float[Tensor, "frames points 2"]
-    errors: Float[Tensor, "frames points"]
+    places: Float[Tensor, "frames skin 2"]
+    errors: Float[Tensor, "frames skin"]
     depths: Float[Tensor, "frames points"]
     depth_errors: Float[Tensor, "frames points"]
+
+    def chosen(self, frames: Int[Tensor, "chosen"]) -> "SkinObservations":
+        """The same of some frames; they may repeat."""
+        return SkinObservations(
+            self.vertices,
+            self.places[frames],
+            self.errors[frames],
+            self.depths[frames],
+            self.depth_errors[frames],
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +118,7 @@ class Observations:
             self.scale[frames],
             self.times[frames],
             self.picture_size,
+            None if self.skin is None else self.skin.chosen(frames),
         )
 
 
@@ -181,8 +192,8 @@ def with_skin(
         world_landmarks=torch.cat([across, depths[:, :count, None]], dim=-1),
         skin=SkinObservations(
             vertices,
-            torch.cat([both, places[:, count:]], dim=1),
-            torch.cat([error, (factors * errors)[:, count:]], dim=1),
+            places[:, count:],
+            (factors * errors)[:, count:],
             depths,
             depth_errors,
         ),

@@ -42,9 +42,10 @@ from handavatar.capture.checks import (
     path_inside,
     text_field,
 )
-from handavatar.fit.landmarks import NUM_LANDMARKS, LandmarkSightings
+from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.rotations import invert_rigid
+from handavatar.hand.landmarks import NUM_LANDMARKS
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.jobs.files import (
     FolderInUse,

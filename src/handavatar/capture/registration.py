@@ -17,7 +17,7 @@ from handavatar.capture.fitting import LANDMARK_ERROR, Observations
 from handavatar.capture.frames import FITTED_SIDE, LANDMARKS, Capture, Frame
 from handavatar.capture.masks import HandMask, mask_coverage
 from handavatar.capture.tracking import TrackedHand
-from handavatar.capture.windows import window_camera
+from handavatar.capture.windows import resized, window_camera
 from handavatar.fit.energy import Observation
 from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.fit.pictures import FramePicture
@@ -52,32 +52,29 @@ def see_landmarks(seen: Observations, fit: HandFit) -> list[LandmarkSightings]:
         fit: focal length, and where landmarks lie beside joints.
     """
     center = torch.tensor(seen.picture_size) / 2
-    if seen.skin is not None:
-        own = seen.skin
-        return [
-            LandmarkSightings(
-                (places - center) / fit.focal,
-                error / fit.focal,
-                depth - depth.mean(),
-                depth_error,
-                fit.offsets,
-                own.vertices,
-            )
-            for places, error, depth, depth_error in zip(
-                own.places, own.errors, own.depths, own.depth_errors, strict=True
-            )
-        ]
-    errors = torch.hypot(seen.uncertainty, LANDMARK_ERROR * seen.scale[:, None]) / fit.focal
-    depths = seen.world_landmarks[..., 2]
+    if seen.skin is None:
+        vertices = torch.zeros(0, dtype=torch.long)
+        places = seen.landmarks
+        errors = torch.hypot(seen.uncertainty, LANDMARK_ERROR * seen.scale[:, None])
+        depths = seen.world_landmarks[..., 2]
+        depth_errors = torch.full_like(depths, DEPTH_ERROR)
+    else:
+        vertices = seen.skin.vertices
+        places = torch.cat([seen.landmarks, seen.skin.places], dim=1)
+        errors = torch.cat([seen.uncertainty, seen.skin.errors], dim=1)
+        depths, depth_errors = seen.skin.depths, seen.skin.depth_errors
     return [
         LandmarkSightings(
-            (places - center) / fit.focal,
-            error,
+            (place - center) / fit.focal,
+            error / fit.focal,
             depth - depth.mean(),
-            torch.full_like(depth, DEPTH_ERROR),
+            depth_error,
             fit.offsets,
+            vertices,
         )
-        for places, error, depth in zip(seen.landmarks, errors, depths, strict=True)
+        for place, error, depth, depth_error in zip(
+            places, errors, depths, depth_errors, strict=True
+        )
     ]
 
 
@@ -107,24 +104,13 @@ def observe_hands(
         zoom = np.eye(2) * (view.width / side)
         picture = FramePicture.of(
             view.resized(side, side),
-            _smaller(torch.from_numpy(window.image).float() / 255, side),
+            resized(torch.from_numpy(window.image).float() / 255, side),
             torch.from_numpy(mask_coverage(mask.level, zoom, np.zeros(2), side)).float(),
-            _smaller(torch.from_numpy(is_known).float()[..., None], side)[..., 0] > 0.999,
+            resized(torch.from_numpy(is_known).float()[..., None], side)[..., 0] > 0.999,
             torch.from_numpy(gains[number]).float(),
         )
         found.append(Observation(picture, hand.time, landmarks[number]))
     return found
-
-
-def _smaller(
-    image: Float[Tensor, "height width channels"], side: int
-) -> Float[Tensor, "side side channels"]:
-    """Means over the pixels that each new one covers."""
-    planes = image.permute(2, 0, 1)[None]
-    small = torch.nn.functional.interpolate(
-        planes, (side, side), mode="bilinear", antialias=True, align_corners=False
-    )
-    return small[0].permute(1, 2, 0)
 
 
 def register_hands(

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from handavatar.capture.windows import Window, resampled
 from handavatar.tracker.model import TrainedTracker
 from handavatar.tracker.network import INPUT_SIDE
-from handavatar.tracker.training import upright_turn
+from handavatar.tracker.points import upright_turn
 
 _LOOKS = ((0.0, 1.45), (math.radians(20), 1.55), (math.radians(-20), 1.35))
 """Turn of a crop from where the hand is upright, and its side in units of the hand's box."""

@@ -64,7 +64,7 @@ from handavatar.hand.pose_sampling import (
     resolve_penetration,
     sample_poses,
 )
-from handavatar.hand.rig import Rig
+from handavatar.hand.rig import Rig, ShapedHand
 from handavatar.hand.rigs import load_rig
 
 TRAINING_GESTURES = (
@@ -165,10 +165,15 @@ class Subject:
     rest_vertices: Float[Tensor, "vertices 3"]
     texture: Float[Tensor, "rows columns 3"]
 
-    def posed_vertices(self, pose: HandPose) -> Float[Tensor, "vertices 3"]:
-        """Skin in the world. The joints are those of the shape coefficients."""
+    @property
+    def rest_hand(self) -> ShapedHand:
+        """In the zero pose. The joints are those of the shape coefficients."""
         shaped = self.rig.shaped(self.shape_coefficients)
-        return replace(shaped, rest_vertices=self.rest_vertices).posed(pose).vertices
+        return replace(shaped, rest_vertices=self.rest_vertices)
+
+    def posed_vertices(self, pose: HandPose) -> Float[Tensor, "vertices 3"]:
+        """Skin in the world."""
+        return self.rest_hand.posed(pose).vertices
 
 
 def make_capture(

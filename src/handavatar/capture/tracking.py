@@ -20,7 +20,6 @@ from handavatar.capture.decoding import VideoFrame
 from handavatar.capture.skin_points import SeenPoints
 from handavatar.capture.windows import FINE_SIDE, MASK_SIDE, Window, resampled, window_around
 
-NUM_LANDMARKS = 21
 LANDMARK_NAMES: tuple[str, ...] = (
     "wrist",
     *(f"thumb_{part}" for part in ("cmc", "mcp", "ip", "tip")),

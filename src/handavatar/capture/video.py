@@ -61,7 +61,6 @@ from handavatar.capture.seen_skin import SeenSkin, count_seen_skin
 from handavatar.capture.skin_points import see_points
 from handavatar.capture.tracking import (
     NO_HAND,
-    NUM_LANDMARKS,
     OTHER_HAND,
     TWO_HANDS,
     Track,
@@ -74,6 +73,7 @@ from handavatar.fit.energy import VIDEO_TEXTURE_SHARE, EnergyOptions
 from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.cameras import Camera, project
+from handavatar.hand.landmarks import NUM_LANDMARKS
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import FolderKind, files_named, mark_folder
@@ -326,10 +326,12 @@ def _laid_on(
     try:
         masks = _found_masks(track, report)
         report(0.5, "fitting the hand")
-        fitted = _fitted_to_landmarks(track, rig, options)
+        seen = observations_of(track)
+        fitted = _fitted_to_landmarks(track, seen, rig, options)
         gains = exposure_gains(track.glances, track.hands, track.picture_size)
         fitted = _registered(
             track,
+            seen,
             masks,
             fitted,
             _known_before_wrist(track, fitted, rig),
@@ -342,6 +344,7 @@ def _laid_on(
         before = _known_before_wrist(track, fitted, rig)
         fitted = _registered(
             track,
+            seen,
             [mask.mask for mask in guided],
             fitted,
             [first & mask.known for first, mask in zip(before, guided, strict=True)],
@@ -462,9 +465,10 @@ def see_skin(track: Track, rig: Rig) -> Track:
 
 
 @one_thread()
-def _fitted_to_landmarks(track: Track, rig: Rig, options: VideoOptions) -> FittedHands:
+def _fitted_to_landmarks(
+    track: Track, observations: Observations, rig: Rig, options: VideoOptions
+) -> FittedHands:
     """Where the landmarks alone have the hand, with its shape and the focal length."""
-    observations = observations_of(track)
     # What made pictures teach about a hand's shape is the shape of made hands.
     fit = fit_hands(rig, _seen_by_mediapipe(track), options.fit)
     if observations.skin is not None:
@@ -475,6 +479,7 @@ def _fitted_to_landmarks(track: Track, rig: Rig, options: VideoOptions) -> Fitte
 
 def _registered(
     track: Track,
+    seen: Observations,
     masks: Sequence[HandMask],
     before: FittedHands,
     known: Sequence[Bool[np.ndarray, "_ _"]],
@@ -484,7 +489,6 @@ def _registered(
     report: Callable[[float], None],
 ) -> FittedHands:
     """The hand laid onto landmarks, masks and texture: the one place that knows how."""
-    seen = observations_of(track)
     observations = observe_hands(
         track.hands, masks, known, gains, before.landmarks, before.fit.focal
     )

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from PIL import Image
+from torch import Tensor
 
 from handavatar.geometry.cameras import Camera
 
@@ -101,6 +102,17 @@ def resampled(
         (side, side), Image.Transform.AFFINE, coefficients, Image.Resampling.BILINEAR
     )
     return np.asarray(view)
+
+
+def resized(
+    image: Float[Tensor, "height width channels"], side: int
+) -> Float[Tensor, "side side channels"]:
+    """A picture with another number of pixels; where it shrinks, means over those that were."""
+    planes = image.permute(2, 0, 1)[None]
+    found = torch.nn.functional.interpolate(
+        planes, (side, side), mode="bilinear", antialias=True, align_corners=False
+    )
+    return found[0].permute(1, 2, 0)
 
 
 def _view_corners(

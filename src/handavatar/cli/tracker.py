@@ -3,25 +3,23 @@
 
 def train(words: list[str]) -> int:
     """Teach the hand tracker on made pictures."""
+    from contextlib import ExitStack
+
     from handavatar.cli.arguments import parse
     from handavatar.synthetic.lessons import TrackerTrainOptions, train_made_tracker
     from handavatar.train.progress import Progress
 
     options = parse(TrackerTrainOptions, words, "tracker train")
     bars: dict[str, Progress] = {}
+    with ExitStack() as shown:
 
-    def report(doing: str, done: int, total: int, loss: float) -> None:
-        if doing not in bars:
-            for bar in bars.values():
-                bar.__exit__(None, None, None)
-            bars[doing] = Progress(doing, total).__enter__()
-        bars[doing].update(done, loss=loss)
+        def report(doing: str, done: int, total: int, loss: float) -> None:
+            if doing not in bars:
+                shown.close()
+                bars[doing] = shown.enter_context(Progress(doing, total))
+            bars[doing].update(done, loss=loss)
 
-    try:
         train_made_tracker(options, report)
-    finally:
-        for bar in bars.values():
-            bar.__exit__(None, None, None)
     print(f"tracker: {options.out}")
     print(f"next: handavatar tracker evaluate --tracker {options.out}")
     return 0

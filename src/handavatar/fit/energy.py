@@ -23,11 +23,12 @@ from handavatar.fit.kinematics import (
     pixel_jacobian,
     rest_with_pose,
 )
-from handavatar.fit.landmarks import NUM_LANDMARKS, LandmarkSightings
+from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.fit.pictures import FramePicture, PictureBand, drawing_camera
 from handavatar.fit.shape import ShapeSpace
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
+from handavatar.hand.landmarks import NUM_LANDMARKS
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import ShapedHand
 from handavatar.render.silhouette import outline_points

@@ -12,12 +12,12 @@ from torch import Tensor
 
 from handavatar.fit.kinematics import RestPoints
 from handavatar.fit.shape import ShapeSpace
-from handavatar.hand.pose import FINGER_BONES, NUM_BONES
+from handavatar.hand.landmarks import LANDMARK_BONES, LANDMARK_ROWS, NUM_LANDMARKS
+from handavatar.hand.pose import NUM_BONES
 from handavatar.hand.rig import ShapedHand
 
-NUM_LANDMARKS = 21
 NUM_OFFSETS = 3 * NUM_LANDMARKS
-_FINGERS = ("thumb", "index", "middle", "ring", "little")
+"""Three for each landmark."""
 _TOLERANCES = {"wrist": 0.010, "cmc": 0.008, "mcp": 0.006, "tip": 0.004}
 _TOLERANCE = 0.003
 
@@ -61,15 +61,11 @@ def landmark_rest(
         vertices: further points, of the skin.
     """
     tips = hand.rig.vertex_sets["fingertips"]
-    bones, rows = [0], [0]
-    for number, finger in enumerate(_FINGERS):
-        chain = FINGER_BONES[finger]
-        bones += [*chain, chain[-1]]
-        rows += [*chain, NUM_BONES + number]
+    rows = list(LANDMARK_ROWS)
     places = torch.cat([hand.rest_joints, hand.rest_vertices[tips]])[rows]
     moving = torch.cat([space.joint_directions, space.directions[tips]])[rows]
     own = torch.eye(NUM_OFFSETS).reshape(21, 3, NUM_OFFSETS)
-    weights = torch.nn.functional.one_hot(torch.tensor(bones), NUM_BONES).to(places)
+    weights = torch.nn.functional.one_hot(torch.tensor(LANDMARK_BONES), NUM_BONES).to(places)
     places = places + offsets.reshape(21, 3)
     directions = torch.cat([moving, own], dim=-1)
     if vertices is not None and len(vertices):

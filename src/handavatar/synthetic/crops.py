@@ -14,12 +14,15 @@ import torch
 from jaxtyping import Bool, Float, Float32, UInt8
 from PIL import Image, ImageDraw
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from handavatar.capture.synthetic import SynthOptions, make_subject
+from handavatar.capture.windows import resized
 from handavatar.geometry.cameras import Camera, project
 from handavatar.geometry.colors import srgb_from_linear
 from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.hand.landmarks import MIDDLE_KNUCKLE
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import (
     GESTURES,
@@ -34,12 +37,11 @@ from handavatar.hand.rig import Rig
 from handavatar.render.skylight import even_directions, sky_light
 from handavatar.synthetic.actor import Actor, Lights, PosedActor
 from handavatar.synthetic.backgrounds import BACKGROUNDS, paint_background
+from handavatar.tracker.network import FOREARM, HAND, OTHER
 from handavatar.tracker.points import TrackedPoints
 
 CROP_SIDE = 128
 """Pixels along a side of a made picture."""
-OTHER, HAND, FOREARM = 0, 1, 2
-"""What a pixel shows."""
 _VIEWS = 5
 _NUM_BACKGROUNDS, _BACKGROUND_SIDE = 10, 224
 _SUBJECTS = 3
@@ -114,7 +116,7 @@ class _Studio:
 
     def __init__(self, rig: Rig, tracked: TrackedPoints, seed: int) -> None:
         self.random = random = np.random.default_rng([seed, 41])
-        self._rig, self._tracked = rig, tracked
+        self._tracked = tracked
         self._actors = []
         for _ in range(_SUBJECTS):
             own = int(random.integers(2**31))
@@ -147,11 +149,7 @@ class _Studio:
         # Fingers lie along -x, so the arm comes from about +x; wrists bend by some 40 degrees.
         elbow = torch.from_numpy(np.array([1.0, 0, 0]) + 0.55 * random.standard_normal(3)).float()
         self._posed = self._actor.posed(pose, elbow)
-        subject = self._actor.subject
-        shaped = replace(
-            subject.rig.shaped(subject.shape_coefficients), rest_vertices=subject.rest_vertices
-        )
-        self._points = self._tracked.positions(shaped, pose)
+        self._points = self._tracked.positions(self._actor.subject.rest_hand, pose)
         self._lights = _draw_scattered_lights(random)
         brought = sky_light(
             self._posed.vertices,
@@ -185,7 +183,7 @@ class _Studio:
         points = (self._points - middle) @ view.T + shift
         camera = _draw_crop(points, random)
         pixels, _ = project(camera, points)
-        size = (points[self._tracked.knuckle] - points[0]).norm()
+        size = (points[MIDDLE_KNUCKLE] - points[0]).norm()
         truth = torch.cat(
             [pixels / CROP_SIDE, ((points[:, 2] - points[0, 2]) / size)[:, None]], dim=1
         )
@@ -259,12 +257,8 @@ class _Studio:
 def _draw_view(random: np.random.Generator) -> Float[Tensor, "3 3"]:
     """How the camera's axes see the hand's: any way round, mostly with the fingers across."""
     if random.random() < 0.2:
-        quaternion = random.standard_normal(4)
-        w, x, y, z = quaternion / np.linalg.norm(quaternion)
-        vector = np.array([x, y, z])
-        angle = 2 * math.atan2(float(np.linalg.norm(vector)), float(w))
-        axis = vector / max(float(np.linalg.norm(vector)), 1e-9)
-        return matrix_from_axis_angle(torch.from_numpy(angle * axis).float())
+        quaternion = Rotation.from_quat(random.standard_normal(4), scalar_first=True)
+        return torch.from_numpy(quaternion.as_matrix()).float()
     axes = torch.eye(3)
     roll = random.uniform(-math.pi, math.pi) if random.random() < 0.4 else random.normal(0, 0.6)
     pitch = random.normal(0, 0.55)
@@ -393,8 +387,4 @@ def _moved(
 def _resized(
     picture: Float[np.ndarray, "rows columns channels"], side: int
 ) -> Float[np.ndarray, "side side channels"]:
-    planes = torch.from_numpy(np.ascontiguousarray(picture)).float().permute(2, 0, 1)[None]
-    found = torch.nn.functional.interpolate(
-        planes, (side, side), mode="bilinear", align_corners=False, antialias=True
-    )
-    return found[0].permute(1, 2, 0).numpy()
+    return resized(torch.from_numpy(np.ascontiguousarray(picture)).float(), side).numpy()

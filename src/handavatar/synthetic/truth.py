@@ -15,7 +15,7 @@ from torch import Tensor
 from handavatar.capture.checks import CaptureError, load_json, number, numbers, text_field
 from handavatar.geometry.cameras import Camera
 from handavatar.hand.pose import HandPose
-from handavatar.hand.rig import PosedHand, Rig
+from handavatar.hand.rig import PosedHand, Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
 
 SCHEMA = 1
@@ -64,10 +64,15 @@ class FilmTruth:
         """The pose in camera axes."""
         return HandPose(self.rotations[frame], self.translations[frame])
 
+    @property
+    def rest_hand(self) -> ShapedHand:
+        """In the zero pose, metres; the joints are those of the shape coefficients."""
+        shaped = self.rig.shaped(self.shape_coefficients)
+        return replace(shaped, rest_vertices=self.rest_vertices)
+
     def posed(self, frame: int) -> PosedHand:
         """The true hand in a frame: its skin in camera axes, metres, and its bones."""
-        shaped = self.rig.shaped(self.shape_coefficients)
-        return replace(shaped, rest_vertices=self.rest_vertices).posed(self.pose(frame))
+        return self.rest_hand.posed(self.pose(frame))
 
     def mask(self, frame: int) -> Float[Tensor, "height width"]:
         """How much of each pixel shows the hand, without the forearm, in [0, 1].

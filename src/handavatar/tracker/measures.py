@@ -5,13 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from handavatar.hand.landmarks import NUM_LANDMARKS
 from handavatar.tracker.model import TrainedTracker
-from handavatar.tracker.network import MAP_SIDE
-from handavatar.tracker.points import NUM_LANDMARKS
+from handavatar.tracker.network import HAND, MAP_SIDE
 from handavatar.tracker.training import CropBatch
 
 _AT_ONCE = 100
-_HAND = 1
 ONE_SIGMA = 0.6827
 """Share of normal errors within their deviation."""
 
@@ -60,8 +59,8 @@ def measure_tracker(tracker: TrainedTracker, pictures: CropBatch) -> TrackerFigu
         mirrored = tracker.tell(np.ascontiguousarray(images[:, :, ::-1]))
         sides = torch.cat([told.is_right > 0, mirrored.is_right < 0])
         stride = pictures.classes.shape[1] // MAP_SIDE
-        true_hand = pictures.classes[part, ::stride, ::stride] == _HAND
-        seen_hand = told.classes.argmax(1) == _HAND
+        true_hand = pictures.classes[part, ::stride, ::stride] == HAND
+        seen_hand = told.classes.argmax(1) == HAND
         joint += int((true_hand & seen_hand).sum())
         union += int((true_hand | seen_hand).sum())
         for name, values in {

@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
+from handavatar.jobs.files import write_atomically
 from handavatar.jobs.threads import one_thread
 from handavatar.tracker.network import HandNetwork, Told
 from handavatar.tracker.points import TrackedPoints
@@ -71,7 +72,7 @@ def save_tracker(path: Path, tracker: TrainedTracker, record: dict[str, object])
         "vertices": json.dumps(points.vertices.tolist()),
         "record": json.dumps(record),
     }
-    save_file(tensors, path, header)
+    write_atomically({path: save(tensors, header)})
 
 
 def read_tracker(path: Path) -> TrainedTracker:

@@ -11,6 +11,8 @@ INPUT_SIDE = 128
 """Pixels along a side of the picture that the network sees."""
 MAP_SIDE = 32
 """Places along a side of its heat maps and of its mask."""
+OTHER, HAND, FOREARM = 0, 1, 2
+"""What a pixel shows."""
 NUM_CLASSES = 3
 _WIDTHS = (32, 64, 128, 192, 256)
 _MAP_WIDTH = 64

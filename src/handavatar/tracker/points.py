@@ -6,12 +6,19 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from handavatar.hand.pose import FINGER_BONES, NUM_BONES, HandPose
+from handavatar.hand.landmarks import LANDMARK_ROWS, MIDDLE_KNUCKLE, NUM_LANDMARKS
+from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.rig import Rig, ShapedHand
 
-NUM_LANDMARKS = 21
-_FINGERS = ("thumb", "index", "middle", "ring", "little")
-MIDDLE_KNUCKLE = 9
+
+def upright_turn(places: Float[Tensor, "crops points 2"]) -> Float[Tensor, "crops"]:
+    """Radians by which upright hands are turned into those of pictures: wrist below the knuckle.
+
+    Args:
+        places: landmarks and what follows them, right and down.
+    """
+    right, down = (places[:, MIDDLE_KNUCKLE] - places[:, 0]).unbind(-1)
+    return torch.atan2(right, -down)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +71,6 @@ class TrackedPoints:
         """Number of points, landmarks included."""
         return NUM_LANDMARKS + len(self.vertices)
 
-    @property
-    def knuckle(self) -> int:
-        """The landmark whose distance from the wrist, landmark 0, is a hand's size."""
-        return MIDDLE_KNUCKLE
-
     def positions(self, hand: ShapedHand, pose: HandPose) -> Float[Tensor, "points 3"]:
         """Where the points are in a pose: metres, world.
 
@@ -77,8 +79,5 @@ class TrackedPoints:
             pose: one.
         """
         posed = hand.posed(pose)
-        bones = [0]
-        for finger in _FINGERS:
-            bones += [*FINGER_BONES[finger], NUM_BONES + _FINGERS.index(finger)]
         joints = torch.cat([posed.joints, posed.vertices[self.tips]])
-        return torch.cat([joints[bones], posed.vertices[self.vertices]])
+        return torch.cat([joints[list(LANDMARK_ROWS)], posed.vertices[self.vertices]])

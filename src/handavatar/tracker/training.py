@@ -2,7 +2,8 @@
 
 import copy
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -15,7 +16,7 @@ from torch.nn.functional import (
 )
 
 from handavatar.tracker.network import INPUT_SIDE, MAP_SIDE, HandNetwork, Told
-from handavatar.tracker.points import MIDDLE_KNUCKLE
+from handavatar.tracker.points import upright_turn
 
 _PLACE_SCALE, _DEPTH_SCALE = 128.0, 20.0
 _WARM_STEPS, _LEAST_RATE, _SMOOTHING, _LONGEST_GRADIENT = 300, 0.005, 0.998, 5.0
@@ -52,15 +53,17 @@ class CropBatch:
     points: Float[Tensor, "crops points 3"]
     is_hand: Bool[Tensor, "crops"]
 
+    @classmethod
+    def joined(cls, parts: Sequence[Mapping[str, Tensor]]) -> "CropBatch":
+        """All pictures of several parts, whose tensors have the names of the fields."""
+        return cls(**{name: torch.cat([part[name] for part in parts]) for name in CROP_FIELDS})
 
-def upright_turn(places: Float[Tensor, "crops points 2"]) -> Float[Tensor, "crops"]:
-    """Radians by which upright hands are turned into those of pictures: wrist below the knuckle.
+    def chosen(self, crops: Int[Tensor, "chosen"] | slice) -> "CropBatch":
+        """Some of the pictures."""
+        return CropBatch(*(getattr(self, name)[crops] for name in CROP_FIELDS))
 
-    Args:
-        places: landmarks and what follows them, right and down.
-    """
-    right, down = (places[:, MIDDLE_KNUCKLE] - places[:, 0]).unbind(-1)
-    return torch.atan2(right, -down)
+
+CROP_FIELDS = tuple(field.name for field in fields(CropBatch))
 
 
 def vary_crops(
