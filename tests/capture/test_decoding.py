@@ -8,12 +8,12 @@ import pytest
 from videos import grey_levels, save_sound, save_video
 
 from handavatar.capture.checks import CaptureError
-from handavatar.capture.decoding import video_frames
+from handavatar.capture.decoding import Sampling, video_frames
 
 
 def test_every_third_picture_of_thirty_per_second(tmp_path: Path) -> None:
     path = save_video(tmp_path / "a.mp4", grey_levels(30))
-    frames = list(video_frames(path, fps=10.0))
+    frames = list(video_frames(path, Sampling(fps=10.0)))
     assert [frame.index for frame in frames] == list(range(0, 30, 3))
     assert np.allclose([frame.time for frame in frames], np.arange(10) / 10, atol=1e-3)
     levels = [float(frame.image[90:, :, 2].mean()) for frame in frames]
@@ -24,12 +24,12 @@ def test_every_third_picture_of_thirty_per_second(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["a.mp4", "a.mov", "a.mkv"])
 def test_common_containers_open(tmp_path: Path, name: str) -> None:
     path = save_video(tmp_path / name, grey_levels(6))
-    assert len(list(video_frames(path, fps=30.0))) == 6
+    assert len(list(video_frames(path, Sampling(fps=30.0)))) == 6
 
 
 def test_stops_at_the_greatest_number_of_pictures(tmp_path: Path) -> None:
     path = save_video(tmp_path / "a.mp4", grey_levels(20))
-    assert len(list(video_frames(path, fps=30.0, max_frames=4))) == 4
+    assert len(list(video_frames(path, Sampling(30.0, max_frames=4)))) == 4
 
 
 def test_large_pictures_are_brought_down(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_refuses_playlists_and_other_containers(tmp_path: Path) -> None:
     playlist = tmp_path / "list.mp4"
     playlist.write_text(f"#EXTM3U\n#EXTINF:1,\n{good}\n#EXT-X-ENDLIST\n")
     assert "not a video" in _refusal(playlist)
-    assert "not a video" in _refusal(save_video(tmp_path / "a.avi", grey_levels(3)))
+    assert "not a video" in _refusal(save_video(tmp_path / "a.nut", grey_levels(3)))
 
 
 def test_refuses_files_cut_short(tmp_path: Path) -> None:

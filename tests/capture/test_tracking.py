@@ -9,7 +9,7 @@ from videos import REAL_VIDEO, needs_real_video
 
 from handavatar.capture import tracking
 from handavatar.capture.checks import CaptureError
-from handavatar.capture.decoding import VideoFrame, video_frames
+from handavatar.capture.decoding import Sampling, VideoFrame, video_frames
 from handavatar.capture.tracking import (
     LANDMARK_NAMES,
     HandFinder,
@@ -167,7 +167,7 @@ def test_a_picture_without_a_hand_shows_none() -> None:
 @needs_real_video
 def test_the_real_hand_is_a_right_one_and_its_mirror_image_a_left_one() -> None:
     pytest.importorskip("mediapipe")
-    frames = list(video_frames(REAL_VIDEO, max_frames=8))
+    frames = list(video_frames(REAL_VIDEO, Sampling(max_frames=8)))
     right = track_hand(frames)
     mirrored = [VideoFrame(f.index, f.time, np.ascontiguousarray(f.image[:, ::-1])) for f in frames]
     left = track_hand(mirrored)
@@ -184,7 +184,7 @@ def test_the_real_hand_is_a_right_one_and_its_mirror_image_a_left_one() -> None:
 @needs_real_video
 def test_two_real_hands_are_refused() -> None:
     pytest.importorskip("mediapipe")
-    frames = list(video_frames(REAL_VIDEO, max_frames=4))
+    frames = list(video_frames(REAL_VIDEO, Sampling(max_frames=4)))
     doubled = [
         VideoFrame(f.index, f.time, np.concatenate([f.image[:, 400:1100]] * 2, axis=1))
         for f in frames

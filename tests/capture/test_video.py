@@ -220,7 +220,7 @@ def _made_video(
     )
     fitted = FittedHands(several, torch.stack(vertices), errors, covariances, [sighting] * _MADE)
     monkeypatch.setattr(video_module, "track_hand", lambda *_: track)
-    monkeypatch.setattr(video_module, "video_frames", lambda *_: iter(()))
+    monkeypatch.setattr(video_module, "frames_of", lambda *_: iter(()))
     monkeypatch.setattr(video_module, "_found_masks", lambda *_: [])
     monkeypatch.setattr(video_module, "_fitted_to_landmarks", lambda *_: fitted)
     monkeypatch.setattr(video_module, "_registered", lambda *_: fitted)

@@ -9,6 +9,12 @@ import pytest
 
 REAL_VIDEO = Path(__file__).parents[3] / "shared/data/real_hand/human_hand_video.mp4"
 
+CASES = Path(__file__).parents[3] / "shared/cases/video"
+
+needs_cases = pytest.mark.skipif(
+    not CASES.is_dir(), reason=f"{CASES} is only in the development folder"
+)
+
 needs_real_video = pytest.mark.skipif(
     not REAL_VIDEO.is_file(), reason=f"{REAL_VIDEO} is only in the development folder"
 )

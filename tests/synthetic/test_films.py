@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from handavatar.capture.checks import CaptureError
-from handavatar.capture.decoding import video_frames
+from handavatar.capture.decoding import Sampling, video_frames
 from handavatar.geometry.cameras import project
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose_sampling import PenetrationProbe, limit_excess
@@ -20,7 +20,7 @@ from handavatar.synthetic.truth import FilmTruth, read_film_truth
 def test_the_mask_is_where_the_picture_differs_from_its_background(
     small_film: FilmTruth, film_folder: Path
 ) -> None:
-    frames = list(video_frames(film_folder / f"{small_film.name}.mp4", small_film.fps))
+    frames = list(video_frames(film_folder / f"{small_film.name}.mp4", Sampling(small_film.fps)))
     assert len(frames) == len(small_film)
     for number in (0, len(frames) - 1):
         mask = small_film.mask(number).numpy()

@@ -45,7 +45,6 @@ from handavatar.bench.measures import (
     mesh_pixels,
 )
 from handavatar.capture.checks import CaptureError
-from handavatar.capture.decoding import video_frames
 from handavatar.capture.default import default_capture
 from handavatar.capture.degraded import DegradeOptions, degrade_capture
 from handavatar.capture.fitted_hand import HandFit
@@ -54,8 +53,13 @@ from handavatar.capture.frames import Capture, Frame, read_capture
 from handavatar.capture.masks import find_mask, learn_colors
 from handavatar.capture.outlines import OutlineMatcher, mask_outline
 from handavatar.capture.registration import register_capture
-from handavatar.capture.tracking import Track, track_hand
-from handavatar.capture.video import VideoOptions, capture_video, observations_of
+from handavatar.capture.tracking import Track
+from handavatar.capture.video import (
+    VideoOptions,
+    capture_video,
+    observations_of,
+    track_video,
+)
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.geometry.cameras import Camera
@@ -366,8 +370,7 @@ class FilmRoad:
     def track(self) -> Track:
         """What the tracker saw."""
         if self._track is None:
-            frames = video_frames(self.path, self.options.fps, self.options.max_frames)
-            self._track = track_hand(frames, self.options.side)
+            self._track = track_video(self.options)
         return self._track
 
     def capture(self) -> Capture:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -39,7 +39,11 @@ _MIN_FRAMES = 8
 _GLANCE_SIDE = 160
 # Of the picture's brightness, 0 to 255: below, a camera sees noise rather than skin.
 _DARK = 30.0
+# Between two pictures, in units of its size: as far does a hand that is followed move.
+_FARTHEST_STEP = 0.6
 TWO_HANDS, NO_HAND, OTHER_HAND = "two hands", "no hand found", "the other hand"
+WhichHand = Literal["only", "left", "right", "larger"]
+"""Of the hands of a video: the only one there is, or one of two."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +137,7 @@ class Track:
         picture_size: width and height of the pictures.
         glances: all pictures that were looked at, with a hand or without, mirrored as the hands.
         votes_right: the share of the tracker's votes that took it for a right hand, in [0, 1].
+        notes: what a person should know of the video, a sentence each.
     """
 
     side: str
@@ -141,6 +146,7 @@ class Track:
     picture_size: tuple[int, int]
     glances: tuple[Glance, ...] = ()
     votes_right: float = 1.0
+    notes: tuple[str, ...] = ()
 
 
 class UnusableTrackError(CaptureError):
@@ -228,60 +234,180 @@ def track_hand(
     frames: Iterable[VideoFrame],
     side: str = "auto",
     progress: Callable[[int, str], None] | None = None,
+    which: WhichHand = "only",
 ) -> Track:
-    """Follows the one hand of a video.
+    """Follows one hand of a video.
 
     Args:
         frames: upright pictures in the order of time.
         side: ``left`` or ``right`` to overrule the tracker, which takes the video as not mirrored.
         progress: called with the number of frames done and a word.
+        which: of two hands.
 
     Raises:
-        UnusableTrackError: no hand, or two hands in more than a tenth of the pictures.
+        UnusableTrackError: no hand, or two hands in more than a tenth of the pictures where the
+            only one is asked for.
         CaptureError: mediapipe is missing.
     """
-    hands: list[TrackedHand] = []
+    seen, glances, picture_size = _all_hands(frames, which != "only", progress)
+    if which == "only":
+        hands, votes, skipped = _only_hand(seen, side)
+    else:
+        hands, votes, skipped = _chosen_hand(seen, which)
+    if side == "auto":
+        side = "right" if sum(votes) >= 0 else "left"
+    if side == "left":
+        hands = [hand.mirrored() for hand in hands]
+        glances = [glance.mirrored() for glance in glances]
+    total = sum(abs(vote) for vote in votes)
+    share = sum(vote for vote in votes if vote > 0) / total if total else 0.5
+    track = Track(side, tuple(hands), skipped, picture_size, tuple(glances), share)
+    _check_found(track)
+    return track
+
+
+@dataclass(frozen=True, eq=False)
+class _SeenHand:
+    """A hand in one picture: its vote is its certainty of a right one, negative of a left one."""
+
+    hand: TrackedHand
+    vote: float
+
+
+@dataclass(eq=False)
+class _Followed:
+    """One hand for as long as it is followed from picture to picture."""
+
+    seen: list[_SeenHand]
+
+    @property
+    def vote(self) -> float:
+        return sum(hand.vote for hand in self.seen)
+
+    @property
+    def size(self) -> float:
+        """Over all pictures, pixels."""
+        return sum(float(np.ptp(hand.hand.landmarks, axis=0).max()) for hand in self.seen)
+
+
+@dataclass(frozen=True, eq=False)
+class _LookedAt:
+    """A picture, the hands in it, and whether there were more than are told."""
+
+    index: int
+    hands: list[_SeenHand]
+    are_two: bool
+
+
+def _all_hands(
+    frames: Iterable[VideoFrame],
+    both: bool,
+    progress: Callable[[int, str], None] | None,
+) -> tuple[list[_LookedAt], list[Glance], tuple[int, int]]:
+    """The hands of all pictures; where there are two, none unless both are asked for."""
+    looked: list[_LookedAt] = []
     glances: list[Glance] = []
-    is_right: list[float] = []
-    skipped: dict[int, str] = {}
-    last: Float[np.ndarray, "21 2"] | None = None
+    last: list[Float[np.ndarray, "21 2"]] = []
     picture_size = (0, 0)
     with HandFinder() as finder:
         for count, frame in enumerate(frames):
             picture_size = (frame.image.shape[1], frame.image.shape[0])
             glances.append(_glance(frame))
             found = finder.track(frame.image)
-            if not found and last is not None:
-                again = finder.look_closely(frame.image, last, 0.0)
-                found = [again] if again is not None else []
-            if len(found) == 1:
-                hand = _combined(finder, frame, found[0])
-                hands.append(hand)
-                is_right.append(found[0].presence if found[0].is_right else -found[0].presence)
-                last = hand.landmarks
-            else:
-                skipped[frame.index] = TWO_HANDS if found else NO_HAND
+            if len(found) < len(last) and (both or not found):
+                again = [
+                    finder.look_closely(frame.image, landmarks, 0.0)
+                    for landmarks in last
+                    if all(not _is_same_hand(one.landmarks, landmarks) for one in found)
+                ]
+                found = _without_doubles([*found, *(look for look in again if look is not None)])
+            are_two = len(found) > 1
+            hands = []
+            if both or not are_two:
+                for sighting in found:
+                    vote = sighting.presence if sighting.is_right else -sighting.presence
+                    hands.append(_SeenHand(_combined(finder, frame, sighting), vote))
+            if hands:
+                last = [seen.hand.landmarks for seen in hands]
+            looked.append(_LookedAt(frame.index, hands, are_two))
             if progress is not None:
                 progress(count + 1, "tracking")
-    majority = "right" if sum(is_right) >= 0 else "left"
-    others = find_other_hand(np.array(is_right), [hand.time for hand in hands])
+    return looked, glances, picture_size
+
+
+def _only_hand(
+    looked: list[_LookedAt], side: str
+) -> tuple[list[TrackedHand], list[float], dict[int, str]]:
+    """The hands, their votes, and why other pictures have none."""
+    skipped = {
+        picture.index: TWO_HANDS if picture.are_two else NO_HAND
+        for picture in looked
+        if not picture.hands
+    }
+    seen = [picture.hands[0] for picture in looked if picture.hands]
+    hands, votes = [one.hand for one in seen], [one.vote for one in seen]
+    majority = "right" if sum(votes) >= 0 else "left"
+    others = find_other_hand(np.array(votes), [hand.time for hand in hands])
     if side not in ("auto", majority) and len(hands) > others.sum() >= _MIN_FRAMES:
         # Both hands are there one after the other, and the smaller part is asked for.
         others = ~others
-    for hand, is_other in zip(hands, others, strict=True):
-        if is_other:
-            skipped[hand.index] = OTHER_HAND
-    hands = [hand for hand, is_other in zip(hands, others, strict=True) if not is_other]
-    if side == "auto":
-        side = majority
-    if side == "left":
-        hands = [hand.mirrored() for hand in hands]
-        glances = [glance.mirrored() for glance in glances]
-    total = sum(abs(vote) for vote in is_right)
-    share = sum(vote for vote in is_right if vote > 0) / total if total else 0.5
-    track = Track(side, tuple(hands), skipped, picture_size, tuple(glances), share)
-    _check_found(track)
-    return track
+    skipped |= {
+        hand.index: OTHER_HAND for hand, is_other in zip(hands, others, strict=True) if is_other
+    }
+    kept = [hand for hand, is_other in zip(hands, others, strict=True) if not is_other]
+    return kept, votes, skipped
+
+
+def _chosen_hand(
+    looked: list[_LookedAt], which: WhichHand
+) -> tuple[list[TrackedHand], list[float], dict[int, str]]:
+    """One of two hands: as :func:`_only_hand`."""
+    followed = _follow(looked)
+    if which == "larger":
+        sizes = {
+            sign: sum(one.size for one in followed if (one.vote >= 0) == (sign > 0))
+            for sign in (1, -1)
+        }
+        sign = max(sizes, key=lambda key: sizes[key])
+    else:
+        sign = 1 if which == "right" else -1
+    chosen = [one for one in followed if (one.vote >= 0) == (sign > 0)]
+    by_index: dict[int, _SeenHand] = {}
+    # Where two are taken for the same side, the one that is followed longer.
+    for one in sorted(chosen, key=lambda one: -len(one.seen)):
+        by_index = {seen.hand.index: seen for seen in one.seen} | by_index
+    skipped = {
+        picture.index: OTHER_HAND if picture.hands else NO_HAND
+        for picture in looked
+        if picture.index not in by_index
+    }
+    seen = [by_index[index] for index in sorted(by_index)]
+    return [one.hand for one in seen], [one.vote for one in seen], skipped
+
+
+def _follow(looked: list[_LookedAt]) -> list[_Followed]:
+    """Hands of neighbouring pictures that are the same, by where they are."""
+    followed: list[_Followed] = []
+    current: list[_Followed] = []
+    for picture in looked:
+        going_on: list[_Followed] = []
+        left = list(picture.hands)
+        for one in current:
+            before = one.seen[-1].hand.landmarks
+            near = min(left, key=lambda seen: _distance(seen.hand.landmarks, before), default=None)
+            if near is not None and _is_same_hand(near.hand.landmarks, before):
+                left.remove(near)
+                one.seen.append(near)
+                going_on.append(one)
+        started = [_Followed([seen]) for seen in left]
+        followed += started
+        current = going_on + started
+    return followed
+
+
+def _is_same_hand(first: Float[np.ndarray, "21 2"], second: Float[np.ndarray, "21 2"]) -> bool:
+    size = float(np.ptp(second, axis=0).max())
+    return _distance(first, second) < _FARTHEST_STEP * size
 
 
 def find_other_hand(
@@ -350,7 +476,7 @@ def _check_found(track: Track) -> None:
     if num_double > _MAX_SHARE_OF_TWO_HANDS * total:
         raise UnusableTrackError(
             f"two hands in {num_double} of {total} pictures; expected one",
-            "record one hand alone, or crop the video to it",
+            "choose one with --hand left, --hand right or --hand larger, or record one alone",
             track,
         )
     if len(track.hands) < _MIN_FRAMES:

@@ -16,7 +16,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from handavatar.capture.checks import CaptureError
-from handavatar.capture.decoding import video_frames
+from handavatar.capture.decoding import Sampling
 from handavatar.capture.exposure import exposure_gains
 from handavatar.capture.fitted_hand import HandFit, HandModel
 from handavatar.capture.fitting import (
@@ -50,6 +50,7 @@ from handavatar.capture.masks import (
 )
 from handavatar.capture.outlines import silhouette
 from handavatar.capture.overview import Tile, contact_sheet, outlined
+from handavatar.capture.picture_folders import frames_of
 from handavatar.capture.registration import (
     observe_hands,
     posed_vertices,
@@ -111,15 +112,23 @@ class VideoOptions:
     """From a video file to a capture."""
 
     file: Path
-    """The video: mp4, mov, mkv or webm; one bare hand, whole, well lit."""
+    """The video (mp4, mov, mkv, webm, avi, ts, gif), or its pictures: a folder, or a pattern such
+    as frames/%04d.png. One bare hand, whole, well lit."""
     out: Path
     """Folder of the capture."""
     fps: float = 10.0
-    """Pictures taken per second of video."""
+    """Pictures taken per second of video: the nearest frame to each of these times."""
     max_frames: int = 600
     """Stop after this many pictures."""
+    start: float = 0.0
+    """Seconds of the video from which pictures are taken."""
+    end: float | None = None
+    """Seconds until which they are; the end of the video by default."""
     side: Literal["auto", "left", "right"] = "auto"
     """Which hand it is; auto takes the video as not mirrored."""
+    hand: Literal["only", "left", "right", "larger", "both"] = "only"
+    """Which of two hands that are seen together is taken; only: there is one; both: two captures,
+    OUT-left and OUT-right."""
     tracker: Literal["mediapipe", "both"] = "both"
     """Who tells where landmarks are: mediapipe alone, or both it and our own tracker, which also
     tells points of the skin and looks where mediapipe has found the hand."""
@@ -147,6 +156,24 @@ class VideoOptions:
         )
     )
     """How the hand is laid onto masks and texture."""
+
+    def sampling(self) -> Sampling:
+        """Which pictures of the video are taken.
+
+        Raises:
+            ValueError: none would be.
+        """
+        return Sampling(self.fps, self.max_frames, self.start, self.end)
+
+    def of_each_hand(self) -> list["VideoOptions"]:
+        """One for every capture that is asked for."""
+        if self.hand != "both":
+            return [self]
+        sides: tuple[Literal["left", "right"], ...] = ("left", "right")
+        return [
+            replace(self, hand=side, out=self.out.with_name(f"{self.out.name}-{side}"))
+            for side in sides
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +232,10 @@ CAUSES: dict[str, tuple[str, str]] = {
     ),
     "small": ("the hand is too small", "come closer to the camera"),
     "dark": ("the pictures are too dark", "record in more light"),
-    TWO_HANDS: ("there are two hands", "record one hand alone, or crop the video to it"),
+    TWO_HANDS: (
+        "there are two hands",
+        "choose one with --hand left, --hand right or --hand larger, or record one alone",
+    ),
     OTHER_HAND: (
         "it is the other hand",
         "record one hand, or choose it with --side left or --side right",
@@ -269,6 +299,7 @@ def capture_video(
             pictures are the cause, a folder beside the would-be capture shows them.
     """
     report = progress or (lambda share, doing: None)
+    options.sampling()  # Refuses what selects nothing, before any work.
     rig = rig or load_rig(options.rig)
     header = {
         "rig_name": rig.name,
@@ -281,10 +312,8 @@ def capture_video(
     }
     CaptureWriter(options.out, **header)  # type: ignore[arg-type]  # refuses a folder in use now
     try:
-        track = track or track_hand(
-            video_frames(options.file, options.fps, options.max_frames),
-            options.side,
-            lambda done, _: report(0.4 * done / (done + 60), "finding the hand"),
+        track = track or track_video(
+            options, lambda done, _: report(0.4 * done / (done + 60), "finding the hand")
         )
     except UnusableTrackError as error:
         raise _failure(options, error.what, error.remedy, error.track, []) from error
@@ -318,6 +347,29 @@ def capture_video(
         contact_sheet(_tiles(track, results)).save(writer.file("overview.png"))
     report(1.0, "done")
     return read_capture(options.out)
+
+
+def track_video(options: VideoOptions, progress: Callable[[int, str], None] | None = None) -> Track:
+    """Finds the hand in the pictures of a video.
+
+    Args:
+        options: which video, pictures and hand.
+        progress: called with the number of pictures done and a word.
+
+    Raises:
+        UnusableTrackError: there is no hand to go on with.
+        CaptureError: the video cannot be read, or an extra is missing.
+    """
+    if options.hand == "both":
+        raise ValueError("--hand both makes two captures: ask for one of VideoOptions.of_each_hand")
+    notes: list[str] = []
+    frames = frames_of(options.file, options.sampling(), notes.append)
+    try:
+        track = track_hand(frames, options.side, progress, options.hand)
+    except UnusableTrackError as error:
+        told = replace(error.track, notes=tuple(notes))
+        raise UnusableTrackError(error.what, error.remedy, told) from error
+    return replace(track, notes=tuple(notes))
 
 
 def _laid_on(
@@ -816,7 +868,8 @@ def _failure(
     mark_folder(folder, FAILED_CAPTURE)
     left_out = _left_out(track, results)
     contact_sheet(_tiles(track, results)).save(folder / "overview.png")
-    _save_json(folder / "reasons.json", {"failed": what, "remedy": remedy} | _skipped(left_out))
+    said = {"failed": what, "remedy": remedy, "notes": list(track.notes)}
+    _save_json(folder / "reasons.json", said | _skipped(left_out))
     return CaptureError(what, f"{remedy}\neach picture and its reason: {folder / 'overview.png'}")
 
 
@@ -889,6 +942,7 @@ def _summary(
     }
     outside = [result.outside_share for result in results if result.frame.name in names]
     return {
+        "notes": list(track.notes),
         "side": track.side,
         # Of the side that was taken: low where --side overruled the tracker.
         "side_votes": round(
@@ -922,6 +976,7 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     other = {"left": "right", "right": "left"}[summary["side"]]
     sure = round(100 * summary["side_votes"])
     lines = [
+        *(f"note: {note}" for note in summary.get("notes", [])),
         f"hand: {summary['side']} ({sure} % of the tracker's votes; --side {other} overrules it)",
         f"frames: {summary['kept']} of {summary['pictures']} kept",
     ]

@@ -3,17 +3,29 @@
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from handavatar.cli.failures import BAD_DATA
+
+if TYPE_CHECKING:
+    from handavatar.capture.video import VideoOptions
 
 
 def video(words: list[str]) -> int:
     """A video of one bare hand -> capture: track, mask, fit pose and shape."""
-    from handavatar.capture.video import VideoOptions, capture_video, summary_lines
+    from handavatar.capture.video import VideoOptions
     from handavatar.cli.arguments import parse
-    from handavatar.train.progress import Progress
 
     options = parse(VideoOptions, words, "capture video", positional=("file",))
+    for asked in options.of_each_hand():
+        _capture_hand(asked)
+    return 0
+
+
+def _capture_hand(options: "VideoOptions") -> None:
+    from handavatar.capture.video import capture_video, summary_lines
+    from handavatar.train.progress import Progress
+
     with Progress("capture video", 100) as progress:
         capture_video(
             options, progress=lambda share, stage: progress.update(round(100 * share), stage)
@@ -26,7 +38,6 @@ def video(words: list[str]) -> int:
         print(line)
     print(f"look at: {options.out / 'overview.png'}")
     print(f"capture: {options.out}\nnext: handavatar train {options.out}")
-    return 0
 
 
 def synth(words: list[str]) -> int:

@@ -19,7 +19,13 @@ from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import write_atomically
 from handavatar.synthetic.crops import MadeCrops, make_crops
 from handavatar.tracker.measures import TrackerFigures, measure_tracker
-from handavatar.tracker.model import TrainedTracker, read_tracker, save_tracker, shipped_tracker
+from handavatar.tracker.model import (
+    TrackerError,
+    TrainedTracker,
+    read_tracker,
+    save_tracker,
+    shipped_tracker,
+)
 from handavatar.tracker.network import HandNetwork
 from handavatar.tracker.points import TrackedPoints
 from handavatar.tracker.training import (
@@ -60,6 +66,10 @@ class TrackerTrainOptions:
     """where the network is taught"""
     processes: int = 0
     """that make pictures; 0: one a core"""
+    start: Path | None = None
+    """tracker whose weights are taught further; drawn anew if None"""
+    rate: float = 2e-3
+    """learning rate at its highest"""
     resume: bool = False
     """go on where a training of this file ended, or was ended"""
 
@@ -81,6 +91,7 @@ def train_made_tracker(
 
     Raises:
         CaptureError: nothing to go on with, or a damaged file.
+        TrackerError: the file to start from is no tracker, or one of other points.
     """
     tell = report or (lambda doing, done, total, loss: None)
     state_file = options.out.with_suffix(".state")
@@ -92,8 +103,14 @@ def train_made_tracker(
     points = TrackedPoints.of(rig, NUM_SKIN_POINTS)
     files = make_pictures(options, lambda done, total: tell("pictures", done, total, 0.0))
     torch.manual_seed(options.seed)
-    network = HandNetwork(len(points)).to(options.device)
-    training = TrackerTraining(network, TrackerOptions(), options.steps, options.seed)
+    network = HandNetwork(len(points))
+    if options.start is not None:
+        first = read_tracker(options.start)
+        if not first.points.are(points):
+            raise TrackerError(f"{options.start}: tells other points of the hand; train it anew")
+        network = first.network
+    taught = TrackerOptions(rate=options.rate)
+    training = TrackerTraining(network.to(options.device), taught, options.steps, options.seed)
     if options.resume:
         try:
             training.restore(load_file(state_file))
@@ -114,7 +131,7 @@ def train_made_tracker(
         "pictures": IN_A_FILE * len(files),
         "steps": training.step,
         "seed": options.seed,
-        "options": asdict(TrackerOptions()),
+        "options": asdict(taught),
     }
     save_tracker(options.out, tracker, record)
     return tracker

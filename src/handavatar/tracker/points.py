@@ -59,6 +59,11 @@ class TrackedPoints:
         """Whether they are points of a rig, so that its skin may be told, and not joints alone."""
         return rig.sha256 == self.rig_sha256
 
+    def are(self, other: "TrackedPoints") -> bool:
+        """Whether they are the same points of the same rig."""
+        is_same_rig = self.rig_sha256 == other.rig_sha256
+        return is_same_rig and self.vertices.equal(other.vertices) and self.tips.equal(other.tips)
+
     def nearest_landmarks(self, rig: Rig) -> Int[Tensor, "skin"]:
         """The landmark that each point of the skin lies nearest to, on the template hand."""
         pose = HandPose(torch.zeros(NUM_BONES, 3), torch.zeros(3))

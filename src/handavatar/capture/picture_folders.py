@@ -1,0 +1,201 @@
+"""Frames that lie as pictures in a folder, as programs and cameras write them."""
+
+import io
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageCms, ImageOps
+
+from handavatar.capture.checks import CaptureError, decoded, picture_in
+from handavatar.capture.decoding import (
+    MAX_WORKING_SIDE,
+    SAME_SHAPE,
+    Sampling,
+    Tell,
+    VideoFrame,
+    video_frames,
+)
+
+_FORMATS = {
+    ".png": "PNG",
+    ".jpg": "JPEG",
+    ".jpeg": "JPEG",
+    ".webp": "WEBP",
+    ".bmp": "BMP",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".ppm": "PPM",
+}
+_OPTIONAL = {".heic": "HEIF", ".heif": "HEIF"}
+_MAX_PIXELS = 64_000_000
+_MIN_SIDE = 96
+_COUNTED = re.compile(r"%0?(\d*)d")
+
+
+def frames_of(source: Path, sampling: Sampling, tell: Tell) -> Iterator[VideoFrame]:
+    """The pictures of a video file, of a folder, or of a pattern such as frames/%04d.png.
+
+    Args:
+        source: which.
+        sampling: how many, and from when to when.
+        tell: called with what was guessed, changed or left out.
+
+    Raises:
+        CaptureError: there are no pictures, or some cannot be read.
+    """
+    if source.is_dir() or (not source.is_file() and _is_pattern(source.name)):
+        return picture_frames(source, sampling, tell)
+    return video_frames(source, sampling, tell)
+
+
+def picture_frames(source: Path, sampling: Sampling, tell: Tell) -> Iterator[VideoFrame]:
+    """The pictures of a folder or of a pattern, in the order of the numbers in their names.
+
+    Pictures have no times: they count as ``sampling.fps`` a second, so that all of them are taken.
+    EXIF rotation is applied and colours with a profile become sRGB.
+
+    Args:
+        source: folder, ``folder/*.png``, or ``folder/frame_%04d.png``.
+        sampling: how many, and from when to when.
+        tell: called with what was guessed, changed or left out.
+
+    Raises:
+        CaptureError: there are no pictures, or one cannot be read.
+    """
+    files = _picture_files(source, tell)
+    tell(f"pictures tell no times: they are taken as {sampling.fps:g} a second (--fps)")
+    sizes = [_upright_size(file) for file in files]
+    largest = max(sizes, key=lambda size: size[0] * size[1])
+    is_same = [abs(w * largest[1] / (h * largest[0]) - 1) <= SAME_SHAPE for w, h in sizes]
+    if not all(is_same):
+        tell(
+            f"{is_same.count(False)} pictures were left out: their width by height is not that "
+            "of the others"
+        )
+    if len(set(sizes)) > 1:
+        tell(
+            f"pictures have {len(set(sizes))} sizes: all are brought to {largest[0]} x {largest[1]}"
+        )
+    scale = min(1.0, MAX_WORKING_SIDE / max(largest))
+    width, height = (max(1, round(side * scale)) for side in largest)
+    taken = 0
+    for number, (file, is_kept) in enumerate(zip(files, is_same, strict=True)):
+        time = number / sampling.fps
+        if not is_kept or time < sampling.start - 1e-6 or sampling.is_over(time):
+            continue
+        if taken == sampling.max_frames:
+            tell(
+                f"{taken} pictures were taken; {len(files) - number} after them were not looked at "
+                "(--max-frames)"
+            )
+            break
+        yield VideoFrame(number, time, _read(file, (width, height)))
+        taken += 1
+
+
+def _is_pattern(name: str) -> bool:
+    return any(sign in name for sign in "*?[") or _COUNTED.search(name) is not None
+
+
+def _picture_files(source: Path, tell: Tell) -> list[Path]:
+    if source.is_dir():
+        folder, found = source, sorted(source.iterdir())
+    elif _COUNTED.search(source.name):
+        folder = source.parent
+        before, after = _COUNTED.split(source.name, maxsplit=1)[::2]
+        name = re.compile(re.escape(before) + r"\d+" + re.escape(after))
+        found = [file for file in _entries(folder) if name.fullmatch(file.name)]
+    else:
+        folder = source.parent
+        found = [file for file in _entries(folder) if file.match(source.name)]
+    found = [file for file in found if file.is_file() and not file.name.startswith(".")]
+    known = _FORMATS | _OPTIONAL
+    files = [file for file in found if file.suffix.lower() in known]
+    if not files:
+        raise CaptureError(
+            f"{source}: no pictures ({len(found)} other files)",
+            f"give a video, or a folder of {', '.join(sorted(known))}",
+        )
+    if len(files) < len(found):
+        tell(f"{len(found) - len(files)} files that are no pictures were left out")
+    return sorted(files, key=lambda file: _natural_order(file.name))
+
+
+def _entries(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise CaptureError(f"{folder}: no such folder", "give a folder of pictures, or a video")
+    return sorted(folder.iterdir())
+
+
+def _natural_order(name: str) -> list[tuple[int, str]]:
+    """So that 2 comes before 10."""
+    parts = re.split(r"(\d+)", name)
+    return [(int(part), "") if part.isdigit() else (0, part) for part in parts]
+
+
+def _opened(file: Path) -> Image.Image:
+    suffix = file.suffix.lower()
+    if suffix in _OPTIONAL:
+        try:
+            from pillow_heif import register_heif_opener
+        except ImportError as error:
+            raise CaptureError(
+                f"{file}: HEIC pictures need a package that is not installed",
+                "pip install 'handavatar[heic]', or save them as JPEG",
+            ) from error
+        register_heif_opener()
+    # A file may be of another kind than its name says.
+    kinds = tuple(sorted({*_FORMATS.values(), (_FORMATS | _OPTIONAL)[suffix]}))
+    return picture_in(file, str(file), kinds, _MAX_PIXELS)
+
+
+def _upright_size(file: Path) -> tuple[int, int]:
+    with _opened(file) as picture:
+        width, height = picture.size
+        if min(width, height) < _MIN_SIDE:
+            raise CaptureError(
+                f"{file}: {width} x {height} pixels; expected at least {_MIN_SIDE} on the short "
+                "side",
+                "give larger pictures",
+            )
+        is_turned = picture.getexif().get(0x0112) in (5, 6, 7, 8)
+    return (height, width) if is_turned else (width, height)
+
+
+def _read(file: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 3"]:
+    picture = _opened(file)
+    try:
+        profile = picture.info.get("icc_profile")
+        if picture.mode.startswith(("I", "F")):
+            # Sixteen bits a pixel.
+            levels = np.asarray(picture, dtype=np.float64) / 257
+            picture = Image.fromarray(levels.round().clip(0, 255).astype(np.uint8))
+        upright = ImageOps.exif_transpose(picture)
+        colored = _srgb(upright, profile)
+    except (OSError, ValueError, SyntaxError, IndexError) as error:
+        raise CaptureError(
+            f"{file} is damaged: {str(error)[:120]}", "restore the file, or leave it out"
+        ) from error
+    if colored.size != size:
+        colored = colored.resize(size, Image.Resampling.BICUBIC)
+    return decoded(colored, str(file), "RGB")
+
+
+def _srgb(picture: Image.Image, profile: bytes | None) -> Image.Image:
+    if profile is None or picture.mode not in ("RGB", "RGBA", "CMYK"):
+        return picture.convert("RGB")
+    try:
+        found = ImageCms.profileToProfile(
+            picture,
+            ImageCms.ImageCmsProfile(io.BytesIO(profile)),
+            ImageCms.createProfile("sRGB"),
+            outputMode="RGB",
+        )
+    except (ImageCms.PyCMSError, OSError):
+        # A profile that cannot be read says nothing.
+        return picture.convert("RGB")
+    assert found is not None
+    return found
