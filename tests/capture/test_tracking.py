@@ -53,7 +53,7 @@ def _install(monkeypatch: pytest.MonkeyPatch, seen: dict[int, list[Sighting]]) -
             self, image: np.ndarray, around: np.ndarray, turn: float
         ) -> Sighting | None:
             found = self.track(image)
-            return found[0] if found else None
+            return min(found, key=lambda seen: abs(seen.landmarks - around).sum(), default=None)
 
     monkeypatch.setattr(tracking, "HandFinder", FalseFinder)
 
@@ -80,7 +80,34 @@ def test_two_hands_all_along_are_refused(monkeypatch: pytest.MonkeyPatch) -> Non
     _install(monkeypatch, {i: both for i in range(4)})
     with pytest.raises(UnusableTrackError, match="two hands in 4 of 20") as caught:
         track_hand(_frames(20))
+    assert "--hand left" in caught.value.remedy
     assert len(caught.value.track.hands) == 16 and len(caught.value.track.skipped) == 4
+
+
+def _moving(right: bool, number: int, size: float = 1.0) -> Sighting:
+    """A hand that goes to and fro on its own side of the picture."""
+    seen = _sighting(right, 4 * np.sin(number) + (0 if right else 160))
+    middle = seen.landmarks.mean(0)
+    return replace(seen, landmarks=middle + size * (seen.landmarks - middle))
+
+
+def test_one_of_two_hands_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    both = {i: [_moving(True, i), _moving(False, i, 1.2)] for i in range(20)}
+    # A picture in which one of them is taken for the other side, one without the left hand, and
+    # one in which they come in another order.
+    both[4] = [_moving(True, 4), replace(_moving(False, 4, 1.2), presence=0.6, is_right=True)]
+    both[9] = [_moving(True, 9)]
+    both[12] = both[12][::-1]
+    _install(monkeypatch, both)
+    right = track_hand(_frames(20), which="right")
+    assert right.side == "right" and len(right.hands) == 20 and right.skipped == {}
+    assert all(hand.landmarks[:, 0].mean() < WIDTH / 2 for hand in right.hands)
+    left = track_hand(_frames(20), which="left")
+    assert left.side == "left"
+    assert left.skipped == {9: "the other hand"} and len(left.hands) == 19
+    # Mirrored, so that it is a right hand on the left side.
+    assert all(hand.landmarks[:, 0].mean() < WIDTH / 2 for hand in left.hands)
+    assert track_hand(_frames(20), which="larger").side == "left"
 
 
 def test_no_hand_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:

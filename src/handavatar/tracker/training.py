@@ -2,8 +2,10 @@
 
 import copy
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import lru_cache
 
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
@@ -11,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import (
     affine_grid,
     binary_cross_entropy_with_logits,
+    conv2d,
     cross_entropy,
     grid_sample,
 )
@@ -149,6 +152,28 @@ def tracker_loss(
     return total + (side * is_hand).sum() / is_hand.sum().clamp_min(1)
 
 
+@lru_cache(maxsize=4)
+def is_bfloat16_fast(device: str) -> bool:
+    """Whether convolutions in bfloat16 are no slower than in 32 bits, measured here.
+
+    Processors without units for it emulate it: a step takes forty times as long.
+
+    Args:
+        device: its kind, such as ``cpu`` or ``cuda``.
+    """
+    seconds = {}
+    for kind in (torch.float32, torch.bfloat16):
+        picture = torch.zeros(4, 64, 32, 32, device=device, dtype=kind)
+        weights = torch.zeros(64, 64, 3, 3, device=device, dtype=kind)
+        tries = []
+        for _ in range(4):
+            began = time.perf_counter()
+            float(conv2d(picture, weights, padding=1).sum())
+            tries.append(time.perf_counter() - began)
+        seconds[kind] = min(tries)
+    return seconds[torch.bfloat16] <= seconds[torch.float32]
+
+
 class TrackerTraining:
     """A network while it is taught, and the mean of its weights over the last steps.
 
@@ -223,8 +248,8 @@ class TrackerTraining:
         for group in self._optimizer.param_groups:
             group["lr"] = rate * (0.5 + 0.5 * math.cos(math.pi * done) + _LEAST_RATE)
         images, classes, points, is_right = vary_crops(batch, self.options, self.generator)
-        # In bfloat16, which a machine may have units for; sums are of 32 bits.
-        with torch.autocast(device.type, torch.bfloat16):
+        # Sums are of 32 bits.
+        with torch.autocast(device.type, torch.bfloat16, enabled=is_bfloat16_fast(device.type)):
             told = self.network(images.to(device))
         loss = tracker_loss(
             told,
