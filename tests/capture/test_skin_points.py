@@ -5,10 +5,11 @@ import pytest
 import torch
 
 from handavatar.capture.fitted_hand import HandFit
-from handavatar.capture.fitting import HAND_SIZE, Observations, with_skin
+from handavatar.capture.fitting import Observations, with_skin
 from handavatar.capture.registration import see_landmarks
 from handavatar.capture.skin_points import SeenPoints, see_points
 from handavatar.capture.windows import window_around
+from handavatar.hand.landmarks import HAND_SIZE
 from handavatar.hand.rig import Rig
 from handavatar.tracker.model import TrainedTracker
 from handavatar.tracker.network import INPUT_SIDE, MAP_SIDE, HandNetwork, Told
@@ -75,6 +76,7 @@ def test_two_trackers_are_surer_where_they_agree_and_less_sure_where_they_do_not
             np.full(24, 3.0),
             depth.double().numpy(),
             np.full(24, 0.1),
+            np.zeros(24),
         )
         for place, depth in zip(own, depths, strict=True)
     ]
@@ -108,7 +110,9 @@ def test_two_trackers_are_surer_where_they_agree_and_less_sure_where_they_do_not
 def test_captures_keep_what_both_saw() -> None:
     places = 100 + 200 * torch.rand(2, 23, 2, generator=torch.Generator().manual_seed(1))
     points = [
-        SeenPoints(place.double().numpy(), np.full(23, 3.0), np.zeros(23), np.full(23, 0.1))
+        SeenPoints(
+            place.double().numpy(), np.full(23, 3.0), np.zeros(23), np.full(23, 0.1), np.zeros(23)
+        )
         for place in places
     ]
     seen = with_skin(_seen(places, 2.0), points, torch.tensor([4, 5]), torch.tensor([0, 1]))
@@ -130,7 +134,11 @@ def test_some_frames_of_what_both_saw_keep_their_skin() -> None:
     places = 100 + 200 * torch.rand(3, 23, 2, generator=torch.Generator().manual_seed(2))
     points = [
         SeenPoints(
-            place.double().numpy(), np.full(23, 3.0), np.full(23, float(depth)), np.full(23, 0.1)
+            place.double().numpy(),
+            np.full(23, 3.0),
+            np.full(23, float(depth)),
+            np.full(23, 0.1),
+            np.zeros(23),
         )
         for depth, place in enumerate(places)
     ]

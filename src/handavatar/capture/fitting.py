@@ -17,6 +17,7 @@ from torch import Tensor
 from handavatar.capture.fitted_hand import HandFit, HandModel, projected
 from handavatar.capture.skin_points import SeenPoints
 from handavatar.geometry.rotations import axis_angle_from_matrix
+from handavatar.hand.landmarks import HAND_SIZE
 from handavatar.hand.pose import FINGER_BONES
 from handavatar.hand.pose_sampling import (
     angles_from_rotations,
@@ -122,8 +123,6 @@ class Observations:
         )
 
 
-HAND_SIZE = 0.093
-"""Metres from the wrist's joint to the middle finger's knuckle: the unit of tracked depths."""
 OWN_ERROR = 0.004
 """Metres by which points of our own tracker are off in the picture, beside what it admits."""
 OWN_DEPTH_ERROR = 0.004
@@ -154,6 +153,7 @@ def with_skin(
     points: Sequence[SeenPoints],
     vertices: Int[Tensor, "skin"],
     nearest: Int[Tensor, "skin"],
+    is_alone: bool = False,
 ) -> Observations:
     """Landmarks of both trackers in one, each as far as it is sure, and our own's skin and depths.
 
@@ -162,6 +162,7 @@ def with_skin(
         points: by our own, in the same frames.
         vertices: of the rig, which points behind the landmarks are; of another rig none.
         nearest: landmark of each of them: where that is contradicted, so is the skin.
+        is_alone: whether ours is the only tracker, and ``seen`` says its landmarks again.
     """
 
     def stacked(name: str) -> Tensor:
@@ -173,6 +174,8 @@ def with_skin(
     other = seen.uncertainty.hypot(LANDMARK_ERROR * scale)
     errors = stacked("errors").hypot(OWN_ERROR * scale)
     apart = places[:, :count] - seen.landmarks
+    if is_alone:
+        apart, other = torch.zeros_like(apart), torch.full_like(other, torch.inf)
     factors = contradiction(apart, errors[:, :count], other)
     factors = torch.cat([factors, factors[:, nearest]], dim=1)
     depth_errors = factors * (HAND_SIZE * stacked("depth_errors")).hypot(

@@ -2,15 +2,18 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from handavatar.capture.windows import Window, resampled
+from handavatar.hand.landmarks import HAND_SIZE, KNUCKLES, MIDDLE_KNUCKLE
+from handavatar.hand.rigs import load_rig
 from handavatar.tracker.model import TrainedTracker
 from handavatar.tracker.network import INPUT_SIDE
-from handavatar.tracker.points import upright_turn
+from handavatar.tracker.points import TrackedPoints, upright_turn
 
 _LOOKS = ((0.0, 1.45), (math.radians(20), 1.55), (math.radians(-20), 1.35))
 """Turn of a crop from where the hand is upright, and its side in units of the hand's box."""
@@ -26,17 +29,23 @@ class SeenPoints:
         depths: behind the wrist's joint, in units of the distance from it to the middle finger's
             knuckle.
         depth_errors: expected.
+        spread: disagreement of the looks, pixels.
     """
 
     places: Float[np.ndarray, "points 2"]
     errors: Float[np.ndarray, "points"]
     depths: Float[np.ndarray, "points"]
     depth_errors: Float[np.ndarray, "points"]
+    spread: Float[np.ndarray, "points"]
 
     def first(self, count: int) -> "SeenPoints":
         """The first so many of them."""
         return SeenPoints(
-            self.places[:count], self.errors[:count], self.depths[:count], self.depth_errors[:count]
+            self.places[:count],
+            self.errors[:count],
+            self.depths[:count],
+            self.depth_errors[:count],
+            self.spread[:count],
         )
 
 
@@ -77,7 +86,40 @@ def see_points(
     depth, depth_error = _combined(
         told.depths.double().numpy()[..., None], told.depth_errors.double().numpy()
     )
-    return SeenPoints(place, error, depth[..., 0], depth_error)
+    spread = np.linalg.norm(places - place, axis=-1).max(0)
+    return SeenPoints(place, error, depth[..., 0], depth_error, spread)
+
+
+def world_places(
+    tracked: TrackedPoints,
+    landmarks: Float[np.ndarray, "21 2"],
+    depths: Float[np.ndarray, "21"],
+) -> Float[np.ndarray, "21 3"]:
+    """Landmarks in metres about their middle, of a hand of the usual size.
+
+    Args:
+        tracked: whose template says how far the knuckles are from the wrist.
+        landmarks: pixels.
+        depths: behind the wrist, in units of the hand's size.
+    """
+    knuckles = list(KNUCKLES)
+    length = _knuckle_distances(tracked.rig_name)
+    # As long as they seem, and the rest of it is depth.
+    flat = np.sqrt(np.maximum(length**2 - depths[knuckles] ** 2, (0.3 * length) ** 2))
+    seen = np.linalg.norm(landmarks[knuckles] - landmarks[0], axis=-1)
+    scale = max(float(np.median(seen / (HAND_SIZE * flat))), 1e-6)
+    across = (landmarks - landmarks.mean(0)) / scale
+    return np.concatenate([across, HAND_SIZE * depths[:, None]], axis=-1)
+
+
+@lru_cache(maxsize=4)
+def _knuckle_distances(rig_name: str) -> Float[np.ndarray, "knuckles"]:
+    """From the wrist, on the template of a rig, in units of the hand's size."""
+    rig = load_rig(rig_name)
+    places = TrackedPoints.of(rig, 0).template_places(rig)
+    lengths: Float[np.ndarray, knuckles]
+    lengths = (places[list(KNUCKLES)] - places[0]).norm(dim=-1).double().numpy()
+    return lengths / float((places[MIDDLE_KNUCKLE] - places[0]).norm())
 
 
 def _combined(

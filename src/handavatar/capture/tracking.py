@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -55,12 +55,22 @@ class Sighting:
         world_landmarks: metres about the hand's centre, camera axes.
         presence: the tracker's certainty, in [0, 1].
         is_right: of a person's right hand, in a picture that is not mirrored.
+        vote: certainty of its being a right one, negative of a left one, in [-1, 1]; of the
+            tracker's certainty of a hand if None.
     """
 
     landmarks: Float[np.ndarray, "21 2"]
     world_landmarks: Float[np.ndarray, "21 3"]
     presence: float
     is_right: bool
+    vote: float | None = None
+
+    @property
+    def side_vote(self) -> float:
+        """Certainty of its being a right hand, negative that of a left one."""
+        if self.vote is not None:
+            return self.vote
+        return self.presence if self.is_right else -self.presence
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +148,7 @@ class Track:
         glances: all pictures that were looked at, with a hand or without, mirrored as the hands.
         votes_right: the share of the tracker's votes that took it for a right hand, in [0, 1].
         notes: what a person should know of the video, a sentence each.
+        is_own: whether our own tracker alone has found the hand.
     """
 
     side: str
@@ -147,6 +158,7 @@ class Track:
     glances: tuple[Glance, ...] = ()
     votes_right: float = 1.0
     notes: tuple[str, ...] = ()
+    is_own: bool = False
 
 
 class UnusableTrackError(CaptureError):
@@ -160,6 +172,36 @@ class UnusableTrackError(CaptureError):
         """Keeps the track, so that it can be shown."""
         super().__init__(what, remedy)
         self.track = track
+
+
+class Finder(Protocol):
+    """What finds hands in the pictures of a video; a context manager."""
+
+    def __enter__(self) -> "Finder":
+        """Itself."""
+        ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Ends it."""
+        ...
+
+    def track(self, image: UInt8[np.ndarray, "height width 3"]) -> list[Sighting]:
+        """All hands of the next picture of a video."""
+        ...
+
+    def look_closely(
+        self,
+        image: UInt8[np.ndarray, "height width 3"],
+        around: Float[np.ndarray, "21 2"],
+        turn: float,
+    ) -> Sighting | None:
+        """The hand near given landmarks, looked for in a turned crop."""
+        ...
 
 
 class HandFinder:
@@ -235,6 +277,7 @@ def track_hand(
     side: str = "auto",
     progress: Callable[[int, str], None] | None = None,
     which: WhichHand = "only",
+    finder: Finder | None = None,
 ) -> Track:
     """Follows one hand of a video.
 
@@ -243,13 +286,15 @@ def track_hand(
         side: ``left`` or ``right`` to overrule the tracker, which takes the video as not mirrored.
         progress: called with the number of frames done and a word.
         which: of two hands.
+        finder: of hands; MediaPipe's if None.
 
     Raises:
         UnusableTrackError: no hand, or two hands in more than a tenth of the pictures where the
             only one is asked for.
         CaptureError: mediapipe is missing.
     """
-    seen, glances, picture_size = _all_hands(frames, which != "only", progress)
+    with finder or HandFinder() as opened:
+        seen, glances, picture_size = _all_hands(opened, frames, which != "only", progress)
     if which == "only":
         hands, votes, skipped = _only_hand(seen, side)
     else:
@@ -300,6 +345,7 @@ class _LookedAt:
 
 
 def _all_hands(
+    finder: Finder,
     frames: Iterable[VideoFrame],
     both: bool,
     progress: Callable[[int, str], None] | None,
@@ -309,29 +355,28 @@ def _all_hands(
     glances: list[Glance] = []
     last: list[Float[np.ndarray, "21 2"]] = []
     picture_size = (0, 0)
-    with HandFinder() as finder:
-        for count, frame in enumerate(frames):
-            picture_size = (frame.image.shape[1], frame.image.shape[0])
-            glances.append(_glance(frame))
-            found = finder.track(frame.image)
-            if len(found) < len(last) and (both or not found):
-                again = [
-                    finder.look_closely(frame.image, landmarks, 0.0)
-                    for landmarks in last
-                    if all(not _is_same_hand(one.landmarks, landmarks) for one in found)
-                ]
-                found = _without_doubles([*found, *(look for look in again if look is not None)])
-            are_two = len(found) > 1
-            hands = []
-            if both or not are_two:
-                for sighting in found:
-                    vote = sighting.presence if sighting.is_right else -sighting.presence
-                    hands.append(_SeenHand(_combined(finder, frame, sighting), vote))
-            if hands:
-                last = [seen.hand.landmarks for seen in hands]
-            looked.append(_LookedAt(frame.index, hands, are_two))
-            if progress is not None:
-                progress(count + 1, "tracking")
+    for count, frame in enumerate(frames):
+        picture_size = (frame.image.shape[1], frame.image.shape[0])
+        glances.append(_glance(frame))
+        found = finder.track(frame.image)
+        if len(found) < len(last) and (both or not found):
+            again = [
+                finder.look_closely(frame.image, landmarks, 0.0)
+                for landmarks in last
+                if all(not _is_same_hand(one.landmarks, landmarks) for one in found)
+            ]
+            found = _without_doubles([*found, *(look for look in again if look is not None)])
+        are_two = len(found) > 1
+        hands = []
+        if both or not are_two:
+            for sighting in found:
+                hand = _combined(finder, frame, sighting)
+                hands.append(_SeenHand(hand, sighting.side_vote))
+        if hands:
+            last = [seen.hand.landmarks for seen in hands]
+        looked.append(_LookedAt(frame.index, hands, are_two))
+        if progress is not None:
+            progress(count + 1, "tracking")
     return looked, glances, picture_size
 
 
@@ -443,7 +488,7 @@ def _glance(frame: VideoFrame) -> Glance:
     return Glance(frame.index, frame.time, np.asarray(picture.reduce(factor)))
 
 
-def _combined(finder: HandFinder, frame: VideoFrame, first: Sighting) -> TrackedHand:
+def _combined(finder: Finder, frame: VideoFrame, first: Sighting) -> TrackedHand:
     """The median of several looks at a picture, and how far they disagree."""
     looks = [first]
     for turn in _TURNS:
@@ -496,13 +541,23 @@ def _check_found(track: Track) -> None:
         )
 
 
+def has_mediapipe() -> bool:
+    """Whether MediaPipe's hand models can be loaded."""
+    try:
+        _mediapipe_hands()
+    except CaptureError:
+        return False
+    return True
+
+
 def _mediapipe_hands() -> Any:
     try:
         from mediapipe.python.solutions.hands import Hands
     except ImportError as error:
         raise CaptureError(
             f"the hand tracker cannot be loaded ({error})",
-            "pip install 'handavatar[video]' (mediapipe 0.10.14: newer ones have no hand models)",
+            "choose --tracker own, which needs no other package, or pip install "
+            "'handavatar[video]' (mediapipe 0.10.14: newer ones have no hand models)",
         ) from error
     return Hands
 

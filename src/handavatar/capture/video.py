@@ -50,6 +50,7 @@ from handavatar.capture.masks import (
 )
 from handavatar.capture.outlines import silhouette
 from handavatar.capture.overview import Tile, contact_sheet, outlined
+from handavatar.capture.own_finder import OwnFinder
 from handavatar.capture.picture_folders import frames_of
 from handavatar.capture.registration import (
     observe_hands,
@@ -59,7 +60,7 @@ from handavatar.capture.registration import (
     window_view,
 )
 from handavatar.capture.seen_skin import SeenSkin, count_seen_skin
-from handavatar.capture.skin_points import see_points
+from handavatar.capture.skin_points import see_points, world_places
 from handavatar.capture.tracking import (
     NO_HAND,
     OTHER_HAND,
@@ -67,6 +68,7 @@ from handavatar.capture.tracking import (
     Track,
     TrackedHand,
     UnusableTrackError,
+    has_mediapipe,
     track_hand,
 )
 from handavatar.capture.windows import Window, resampled, window_camera
@@ -129,9 +131,9 @@ class VideoOptions:
     hand: Literal["only", "left", "right", "larger", "both"] = "only"
     """Which of two hands that are seen together is taken; only: there is one; both: two captures,
     OUT-left and OUT-right."""
-    tracker: Literal["mediapipe", "both"] = "both"
-    """Who tells where landmarks are: mediapipe alone, or both it and our own tracker, which also
-    tells points of the skin and looks where mediapipe has found the hand."""
+    tracker: Literal["auto", "own", "mediapipe", "both"] = "auto"
+    """Who finds the hand and tells where its landmarks are: our own tracker, mediapipe, or both,
+    mediapipe finding the hand; auto: both where mediapipe is installed, else our own."""
     size: int | None = None
     """Side of the stored pictures, pixels; by default 512 where hands are as large, else 256."""
     min_confidence: float = 0.5
@@ -317,7 +319,7 @@ def capture_video(
         )
     except UnusableTrackError as error:
         raise _failure(options, error.what, error.remedy, error.track, []) from error
-    if options.tracker == "both":
+    if track.is_own or options.tracker != "mediapipe":
         track = see_skin(track, rig)
     # By time, over all pictures, before anybody knows which of them can be fitted.
     splits = splits_by_index(track)
@@ -363,13 +365,21 @@ def track_video(options: VideoOptions, progress: Callable[[int, str], None] | No
     if options.hand == "both":
         raise ValueError("--hand both makes two captures: ask for one of VideoOptions.of_each_hand")
     notes: list[str] = []
+    is_own = options.tracker == "own" or (options.tracker == "auto" and not has_mediapipe())
+    if is_own and options.tracker == "auto":
+        notes.append(
+            "MediaPipe is not installed, so our own tracker alone finds the hand; both together "
+            "are more exact (pip install 'handavatar[video]')"
+        )
     frames = frames_of(options.file, options.sampling(), notes.append)
     try:
-        track = track_hand(frames, options.side, progress, options.hand)
+        track = track_hand(
+            frames, options.side, progress, options.hand, OwnFinder() if is_own else None
+        )
     except UnusableTrackError as error:
         told = replace(error.track, notes=tuple(notes))
         raise UnusableTrackError(error.what, error.remedy, told) from error
-    return replace(track, notes=tuple(notes))
+    return replace(track, notes=tuple(notes), is_own=is_own)
 
 
 def _laid_on(
@@ -474,17 +484,19 @@ def _on_all_cores(
 
 def observations_of(track: Track) -> Observations:
     """What the trackers saw, as tensors."""
-    seen = _seen_by_mediapipe(track)
+    seen = _seen_by_finder(track)
     points = [hand.points for hand in track.hands if hand.points is not None]
     if len(points) < len(track.hands):
         return seen
     tracked = shipped_tracker().points
     num_skin = len(points[0].places) - NUM_LANDMARKS
     nearest = tracked.nearest_landmarks(load_rig(tracked.rig_name))[:num_skin]
-    return with_skin(seen, points, tracked.vertices[:num_skin], nearest)
+    return with_skin(seen, points, tracked.vertices[:num_skin], nearest, track.is_own)
 
 
-def _seen_by_mediapipe(track: Track) -> Observations:
+def _seen_by_finder(track: Track) -> Observations:
+    """The landmarks of what has found the hand."""
+
     def stacked(values: list[object]) -> Tensor:
         return torch.from_numpy(np.array(values)).float()
 
@@ -507,12 +519,24 @@ def see_skin(track: Track, rig: Rig) -> Track:
     """
     tracker = shipped_tracker()
     count = len(tracker.points) if tracker.points.fit(rig) else NUM_LANDMARKS
-    points = _on_all_cores(
-        lambda hand: see_points(tracker, hand.window, hand.landmarks).first(count),
-        track.hands,
-        lambda share: None,
-    )
-    hands = [replace(hand, points=seen) for hand, seen in zip(track.hands, points, strict=True)]
+
+    def seen_hand(hand: TrackedHand) -> TrackedHand:
+        seen = see_points(tracker, hand.window, hand.landmarks)
+        if track.is_own:
+            # It was found before anybody knew that it has to be mirrored, or not.
+            seen = see_points(tracker, hand.window, seen.places[:NUM_LANDMARKS])
+            landmarks = seen.places[:NUM_LANDMARKS]
+            hand = replace(
+                hand,
+                landmarks=landmarks,
+                spread=seen.spread[:NUM_LANDMARKS],
+                world_landmarks=world_places(
+                    tracker.points, landmarks, seen.depths[:NUM_LANDMARKS]
+                ),
+            )
+        return replace(hand, points=seen.first(count))
+
+    hands = _on_all_cores(seen_hand, track.hands, lambda share: None)
     return replace(track, hands=tuple(hands))
 
 
@@ -521,8 +545,9 @@ def _fitted_to_landmarks(
     track: Track, observations: Observations, rig: Rig, options: VideoOptions
 ) -> FittedHands:
     """Where the landmarks alone have the hand, with its shape and the focal length."""
-    # What made pictures teach about a hand's shape is the shape of made hands.
-    fit = fit_hands(rig, _seen_by_mediapipe(track), options.fit)
+    # What made pictures teach about a hand's shape is the shape of made hands: where another
+    # tracker has found the hand, its landmarks alone tell it.
+    fit = fit_hands(rig, observations if track.is_own else _seen_by_finder(track), options.fit)
     if observations.skin is not None:
         fit = fit_poses(rig, observations, fit, options.fit)
     vertices = HandModel(rig).all_vertices(fit)

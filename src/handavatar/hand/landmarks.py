@@ -5,6 +5,11 @@ from handavatar.hand.pose import FINGER_BONES, NUM_BONES
 NUM_LANDMARKS = 21
 MIDDLE_KNUCKLE = 9
 """The landmark whose distance from the wrist, landmark 0, is a hand's size."""
+KNUCKLES = (5, 9, 13, 17)
+"""Landmarks where the four long fingers begin; with the wrist they hardly move in a hand."""
+HAND_SIZE = 0.093
+"""Metres from the wrist's joint to the middle finger's knuckle of a usual hand: the unit of tracked
+depths."""
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 LANDMARK_BONES: tuple[int, ...] = (

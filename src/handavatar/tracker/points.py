@@ -53,7 +53,7 @@ class TrackedPoints:
             farthest = int(distance.argmax())
             chosen.append(farthest)
             distance = distance.minimum((places - places[farthest]).norm(dim=-1))
-        return cls(rig.name, rig.sha256, tips, torch.tensor(chosen))
+        return cls(rig.name, rig.sha256, tips, torch.tensor(chosen, dtype=torch.long))
 
     def fit(self, rig: Rig) -> bool:
         """Whether they are points of a rig, so that its skin may be told, and not joints alone."""
@@ -64,11 +64,15 @@ class TrackedPoints:
         is_same_rig = self.rig_sha256 == other.rig_sha256
         return is_same_rig and self.vertices.equal(other.vertices) and self.tips.equal(other.tips)
 
-    def nearest_landmarks(self, rig: Rig) -> Int[Tensor, "skin"]:
-        """The landmark that each point of the skin lies nearest to, on the template hand."""
+    def template_places(self, rig: Rig) -> Float[Tensor, "points 3"]:
+        """Where the points are on the template hand, metres."""
         pose = HandPose(torch.zeros(NUM_BONES, 3), torch.zeros(3))
         shape = torch.zeros(rig.shape_directions.shape[-1])
-        places = self.positions(rig.shaped(shape), pose)
+        return self.positions(rig.shaped(shape), pose)
+
+    def nearest_landmarks(self, rig: Rig) -> Int[Tensor, "skin"]:
+        """The landmark that each point of the skin lies nearest to, on the template hand."""
+        places = self.template_places(rig)
         landmarks, skin = places[:NUM_LANDMARKS], places[NUM_LANDMARKS:]
         return (skin[:, None] - landmarks).norm(dim=-1).argmin(1)
 
