@@ -66,7 +66,7 @@ MAY_IMPORT = {
     }.items()
 }
 # Heavy or optional packages that a function may import when it needs them.
-OPTIONAL_EXTRAS = {"mediapipe", "cv2", "mitsuba", "drjit", "h5py"}
+OPTIONAL_EXTRAS = {"mediapipe", "cv2", "mitsuba", "drjit", "h5py", "pillow_heif"}
 # Modules that import such a package (triton) at their top.
 OPTIONAL_MODULES = {
     "handavatar.field.fused",

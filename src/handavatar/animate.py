@@ -9,12 +9,10 @@ import io
 import json
 import math
 from dataclasses import asdict, dataclass, replace
-from fractions import Fraction
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
-import av
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -31,6 +29,7 @@ from handavatar.geometry.colors import eight_bits
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
 from handavatar.jobs.files import FolderKind, UnfinishedFolder, files_named, refuse_folder_in_use
+from handavatar.jobs.video_writer import VideoWriter
 from handavatar.processes import joined_processes
 from handavatar.retouch import Look
 
@@ -329,38 +328,6 @@ def pass_pictures(rendering: Rendering, side: str = "right") -> dict[str, np.nda
     if side == "left":
         pictures = {name: np.ascontiguousarray(value[:, ::-1]) for name, value in pictures.items()}
     return pictures
-
-
-class VideoWriter:
-    """Writes RGB pictures into an H.264 video that every player opens."""
-
-    def __init__(self, path: Path, fps: float, size: int, width: int | None = None) -> None:
-        """Opens the file; pictures of odd size lose their last row or column.
-
-        Args:
-            path: ends in ``.mp4``.
-            fps: pictures per second.
-            size: pixels along a side.
-            width: of a picture that is no square, which then is ``size`` high.
-        """
-        self._height, self._width = size // 2 * 2, (width or size) // 2 * 2
-        self._container = av.open(str(path), "w")
-        rate = Fraction(fps).limit_denominator(1000)
-        self._stream: Any = self._container.add_stream("libx264", rate=rate)
-        self._stream.width, self._stream.height = self._width, self._height
-        self._stream.pix_fmt = "yuv420p"
-        self._stream.options = {"crf": "18"}
-
-    def add(self, pixels: np.ndarray) -> None:
-        """Adds one picture, (size, width, 3), 8 bit."""
-        cut = np.ascontiguousarray(pixels[: self._height, : self._width])
-        frame = av.VideoFrame.from_ndarray(cut, format="rgb24")
-        self._container.mux(self._stream.encode(frame))
-
-    def close(self) -> None:
-        """Finishes the file."""
-        self._container.mux(self._stream.encode())
-        self._container.close()
 
 
 def _spread(length: int, count: int | None) -> list[int]:

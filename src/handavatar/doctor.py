@@ -59,7 +59,8 @@ def examine() -> list[Finding]:
         _disk(),
         _video_codecs(),
         *_shipped_files(),
-        _extra("video", ("mediapipe", "cv2"), "handavatar capture video"),
+        _extra("video", ("cv2",), "handavatar capture video"),
+        _mediapipe(),
         _made_captures(),
         _lpips(),
     ]
@@ -151,6 +152,15 @@ def _extra(extra: str, packages: tuple[str, ...], needed_by: str) -> Finding:
         found = f"{' and '.join(absent)} not installed: {needed_by} will not run"
         return Finding(f"extra {extra}", "optional", found, remedy)
     return Finding(f"extra {extra}", "ok", f"{packages[0]} {_version(packages[0])}: {needed_by}")
+
+
+def _mediapipe() -> Finding:
+    if importlib.util.find_spec("mediapipe") is not None:
+        found = f"mediapipe {_version('mediapipe')}: capture video --tracker both"
+        return Finding("mediapipe", "ok", found)
+    found = "not installed: capture video finds hands by its own tracker alone, less exactly"
+    remedy = "with Python 3.12 or older: pip install 'handavatar[video]'"
+    return Finding("mediapipe", "optional", found, remedy)
 
 
 def _made_captures() -> Finding:

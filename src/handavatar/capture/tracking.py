@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -174,6 +174,7 @@ class UnusableTrackError(CaptureError):
         self.track = track
 
 
+@runtime_checkable
 class Finder(Protocol):
     """What finds hands in the pictures of a video; a context manager."""
 

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from handavatar import __version__
-from handavatar.cli import avatar, bench, capture, default, prior, rig, tracker
+from handavatar.cli import avatar, bench, capture, default, motion, prior, rig, tracker
 from handavatar.cli.failures import USAGE, report_failure
 
 Command = Callable[[list[str]], int]
@@ -23,6 +23,7 @@ COMMANDS: dict[str, Command] = {
     "capture benchmark": capture.benchmark,
     "capture degrade": capture.degrade,
     "capture check": capture.check,
+    "motion from": motion.from_source,
     "rig info": rig.info,
     "rig import-mano": rig.import_mano,
     "rig refine": rig.refine,

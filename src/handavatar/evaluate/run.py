@@ -12,7 +12,6 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from handavatar.animate import VideoWriter
 from handavatar.avatar import HandAvatar, Rendering, chosen_device
 from handavatar.capture.frames import (
     FITTED_SIDE,
@@ -50,6 +49,7 @@ from handavatar.evaluate.unseen import unseen_figures, unseen_pictures
 from handavatar.fit.register import RegisterOptions
 from handavatar.hand.pose import HandPose
 from handavatar.jobs.files import FolderKind, claim_folder
+from handavatar.jobs.video_writer import VideoWriter
 
 
 def _is_older_evaluation(folder: Path) -> bool:

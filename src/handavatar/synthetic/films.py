@@ -10,12 +10,10 @@ import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-import av
 import numpy as np
 import torch
-from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import Float, UInt8
 from safetensors.torch import save_file
 from scipy import ndimage
@@ -36,6 +34,7 @@ from handavatar.hand.pose_sampling import (
 )
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.video_writer import VideoWriter
 from handavatar.render.rasterize import rasterize_projected
 from handavatar.synthetic.actor import Actor, Lights, PosedActor, draw_lights
 from handavatar.synthetic.backgrounds import Background, paint_background
@@ -49,7 +48,6 @@ _SHADOW_STEP = 4
 _PALM_VIEW = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 _NOT_YET_SMOOTH = 0.7
 # BT.709 in the numbers of ITU-T H.273.
-_BT709 = 1
 
 
 @dataclass(frozen=True)
@@ -205,7 +203,7 @@ def make_film(
     masks = []
     # The video last: who finds it finds the truth as well.
     aside = folder / f".{options.name}.part.mp4"
-    with _Recorder(aside, options) as recorder:
+    with VideoWriter(aside, options.fps, options.height, options.width, options.crf) as recorder:
         for frame in range(options.num_frames):
             picture, mask = stage.frame(frame)
             recorder.add(picture)
@@ -425,34 +423,3 @@ def _pose_between(motion: Motion, time: float) -> HandPose:
         axis_angle_from_matrix(first @ matrix_from_axis_angle(share * turn)),
         torch.lerp(motion.translations[start], motion.translations[end], share),
     )
-
-
-class _Recorder:
-    """Writes H.264 in an mp4 that says BT.709 and is BT.709."""
-
-    def __init__(self, path: Path, options: FilmOptions) -> None:
-        self._container = av.open(str(path), "w")
-        stream: Any = self._container.add_stream("libx264", rate=round(options.fps))
-        stream.width, stream.height, stream.pix_fmt = options.width, options.height, "yuv420p"
-        # One thread: the same bits on every machine.
-        stream.options = {"crf": str(options.crf), "threads": "1"}
-        context = stream.codec_context
-        context.color_primaries = context.color_trc = context.colorspace = _BT709
-        context.color_range = ColorRange.MPEG
-        self._stream = stream
-
-    def __enter__(self) -> "_Recorder":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._container.mux(self._stream.encode())
-        self._container.close()
-
-    def add(self, picture: UInt8[np.ndarray, "height width 3"]) -> None:
-        frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-        converted = frame.reformat(
-            format="yuv420p",
-            dst_colorspace=Colorspace.ITU709,
-            dst_color_range=ColorRange.MPEG,
-        )
-        self._container.mux(self._stream.encode(converted))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from handavatar.animate import VideoWriter
+from handavatar.jobs.video_writer import VideoWriter
 from handavatar.view.scene import Moment, Scene
 from handavatar.view.studio import FLUID_SIZE, STAGES, Interrupted, Pixels, Studio
 from handavatar.view.turns import Busy, Job, Overtaken, Turns

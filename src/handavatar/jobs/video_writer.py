@@ -1,0 +1,65 @@
+"""Writing films that every player opens and shows in the same colours."""
+
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+from av.video.reformatter import ColorRange, Colorspace
+from jaxtyping import UInt8
+
+# Of ITU-T H.273: matrix, primaries and transfer alike.
+_BT709 = 1
+
+
+class VideoWriter:
+    """Writes RGB pictures into an H.264 film that is BT.709 and says so.
+
+    The same pictures give the same film, bit by bit.
+    """
+
+    def __init__(
+        self, path: Path, fps: float, size: int, width: int | None = None, crf: int = 18
+    ) -> None:
+        """Opens the file; pictures of odd size lose their last row or column.
+
+        Args:
+            path: ends in ``.mp4``.
+            fps: pictures per second.
+            size: pixels along a side.
+            width: of a picture that is no square, which then is ``size`` high.
+            crf: constant rate factor: smaller is nearer to the pictures.
+        """
+        self._height, self._width = size // 2 * 2, (width or size) // 2 * 2
+        self._container = av.open(str(path), "w")
+        rate = Fraction(fps).limit_denominator(1000)
+        self._stream: Any = self._container.add_stream("libx264", rate=rate)
+        self._stream.width, self._stream.height = self._width, self._height
+        self._stream.pix_fmt = "yuv420p"
+        # One thread: with several, who comes first decides about bits.
+        self._stream.options = {"crf": str(crf), "threads": "1"}
+        context = self._stream.codec_context
+        context.color_primaries = context.color_trc = context.colorspace = _BT709
+        context.color_range = ColorRange.MPEG
+
+    def __enter__(self) -> "VideoWriter":
+        """Itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Finishes the file."""
+        self.close()
+
+    def add(self, pixels: UInt8[np.ndarray, "height width 3"]) -> None:
+        """Adds one picture, sRGB."""
+        cut = np.ascontiguousarray(pixels[: self._height, : self._width])
+        frame = av.VideoFrame.from_ndarray(cut, format="rgb24").reformat(
+            format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+        )
+        self._container.mux(self._stream.encode(frame))
+
+    def close(self) -> None:
+        """Finishes the file."""
+        self._container.mux(self._stream.encode())
+        self._container.close()
