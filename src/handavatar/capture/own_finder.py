@@ -31,16 +31,20 @@ _ROOM = 1.35
 """Side of a crop in units of the box of what was seen of the hand in the one before."""
 _NEAR = 0.07
 """Shares of a crop's side within which pixels of a hand are near one of its points."""
-_MOST_ERROR, _MOST_MOTION, _LEAST_PRESENCE = 0.075, 0.04, 0.6
-"""Expected error of points and their motion in the last round, in units of the crop's side, up to
-which a hand is believed that nothing was known of."""
-_MOST_ERROR_FOLLOWED = 0.1
-_SECOND_ERROR = 0.03
+_MOST_ERROR, _MOST_MOTION, _LEAST_PRESENCE = 0.12, 0.04, 0.997
+"""Expected error of points, in units of what they span, their motion in the last round, in units of
+the crop's side, and probability of a hand, with which one is believed that nothing was known of."""
+_MOST_ERROR_FOLLOWED, _LEAST_PRESENCE_FOLLOWED = 0.16, 0.98
+_SECOND_ERROR = 0.04
 """Up to which a second hand is believed."""
+_SMALLEST = 0.1
+"""Extent of a hand's points in units of the picture's shorter side, at least."""
 _PATIENCE = 3
 """Pictures without a hand after which only every third is searched."""
-_CLEAR_SIDE = 1.0
-"""Logits by which the network has to prefer one side for its vote to count."""
+_CLEAR_SIDE, _CLEAR_ERROR = 1.5, 0.035
+"""Logits by which the network has to prefer one side, and how exactly it has to see the hand, for
+its vote to count fully."""
+_UNCLEAR_VOTE = 0.2
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,16 @@ class _Seen:
     hand: Float[np.ndarray, "places 2"]
     border: float
     motion: float = 1.0
+
+    @property
+    def extent(self) -> float:
+        """Of the points, pixels."""
+        return float(np.ptp(self.points, axis=0).max())
+
+    @property
+    def vagueness(self) -> float:
+        """The expected error in units of what the points span: large where they fall together."""
+        return self.error * self.look.side / max(self.extent, 1e-6)
 
     def score(self, short_side: float) -> float:
         """How much it looks like a whole hand; larger ones first, since fingers look like hands."""
@@ -169,7 +183,7 @@ class OwnFinder:
         side = float((high - low).max()) * 1.5
         looks = [_Look((float(x), float(y)), side, upright + turn, flip) for flip in (False, True)]
         first, second = sorted(self._ask(image, looks), key=lambda seen: -seen.right)
-        if first.presence < _LEAST_PRESENCE or first.error > _MOST_ERROR_FOLLOWED:
+        if not _is_followed(first, image):
             return None
         return self._sighting(first, second)
 
@@ -180,7 +194,7 @@ class OwnFinder:
         pair = self._refined(image, looks, _ROUNDS_OF_FOLLOWING)
         short_side = float(min(image.shape[:2]))
         first, second = sorted(pair, key=lambda seen: -seen.score(short_side))
-        if first.presence < _LEAST_PRESENCE or first.error > _MOST_ERROR_FOLLOWED:
+        if not _is_followed(first, image):
             return None
         # What has shrunk to a finger, or has grown over the picture, is no longer the hand.
         if not 0.5 < first.look.side / look.side < 2.0:
@@ -202,12 +216,12 @@ class OwnFinder:
         pairs = []
         for one, other in zip(refined[::2], refined[1::2], strict=True):
             first, second = sorted((one, other), key=lambda seen: -seen.score(short_side))
-            is_hand = first.presence >= _LEAST_PRESENCE and first.error <= _MOST_ERROR
-            if is_hand and first.motion <= _MOST_MOTION:
+            is_hand = first.presence >= _LEAST_PRESENCE and first.vagueness <= _MOST_ERROR
+            if is_hand and first.motion <= _MOST_MOTION and _is_large(first, image):
                 pairs.append((first, second))
         pairs.sort(key=lambda pair: -pair[0].score(short_side))
         apart = _without_doubles(pairs)
-        return apart[:1] + [pair for pair in apart[1:2] if pair[0].error <= _SECOND_ERROR]
+        return apart[:1] + [pair for pair in apart[1:2] if pair[0].vagueness <= _SECOND_ERROR]
 
     def _refined(
         self, image: UInt8[np.ndarray, "height width 3"], looks: Sequence[_Look], rounds: int
@@ -257,7 +271,8 @@ class OwnFinder:
         is_right = not first.look.is_mirrored
         if preferred < 0:
             is_right = not is_right
-        sure = 0.0 if abs(preferred) < _CLEAR_SIDE else first.presence * math.tanh(abs(preferred))
+        is_clear = abs(preferred) >= _CLEAR_SIDE and first.vagueness <= _CLEAR_ERROR
+        sure = first.presence * math.tanh(abs(preferred)) * (1.0 if is_clear else _UNCLEAR_VOTE)
         landmarks = first.points[:NUM_LANDMARKS]
         return Sighting(
             landmarks,
@@ -266,6 +281,16 @@ class OwnFinder:
             is_right,
             sure if is_right else -sure,
         )
+
+
+def _is_large(seen: _Seen, image: UInt8[np.ndarray, "height width 3"]) -> bool:
+    return seen.extent >= _SMALLEST * min(image.shape[:2])
+
+
+def _is_followed(seen: _Seen, image: UInt8[np.ndarray, "height width 3"]) -> bool:
+    """Whether it is believed where a hand has been before."""
+    is_hand = seen.presence >= _LEAST_PRESENCE_FOLLOWED
+    return is_hand and seen.vagueness <= _MOST_ERROR_FOLLOWED and _is_large(seen, image)
 
 
 def _looks_all_over(width: int, height: int) -> list[_Look]:

@@ -35,6 +35,8 @@ _VIEW_SCALE = 2.0
 _MAX_SHARE_OF_TWO_HANDS = 0.1
 # Seconds before or after; pictures in there that speak for the other hand, and their share.
 _SIDE_WINDOW, _MIN_AGAINST, _AGAINST_SHARE = 0.6, 4, 0.8
+# A vote that says anything; less is that of a tracker that does not know.
+_CLEAR_VOTE = 0.3
 _MIN_FRAMES = 8
 _GLANCE_SIDE = 160
 # Of the picture's brightness, 0 to 255: below, a camera sees noise rather than skin.
@@ -470,7 +472,7 @@ def find_other_hand(
     """
     is_other = np.zeros(len(votes), dtype=bool)
     sign = 1.0 if votes.sum() >= 0 else -1.0
-    is_against = sign * votes < 0
+    is_against = sign * votes < -_CLEAR_VOTE
     moments = np.array(times)
     for number in np.flatnonzero(is_against):
         is_near = np.abs(moments - moments[number]) <= _SIDE_WINDOW
