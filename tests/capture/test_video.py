@@ -28,6 +28,7 @@ from handavatar.capture.video import (
     splits_by_index,
     stored_size,
     summary_lines,
+    track_video,
 )
 from handavatar.capture.windows import (
     FINE_SIDE,
@@ -84,6 +85,49 @@ def test_a_video_without_a_hand_says_so_and_shows_its_pictures(tmp_path: Path) -
         assert read_marker(tmp_path / folder)["kind"] == "failed capture"
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"wall.mp4", "out.failed", "out.failed-2"}
+
+
+def test_both_hands_are_two_captures() -> None:
+    options = VideoOptions(Path("a.mp4"), Path("x/out"), hand="both")
+    asked = options.of_each_hand()
+    assert [(each.hand, each.out) for each in asked] == [
+        ("left", Path("x/out-left")),
+        ("right", Path("x/out-right")),
+    ]
+    alone = replace(options, hand="larger")
+    assert alone.of_each_hand() == [alone]
+    with pytest.raises(ValueError, match="--hand both makes two captures"):
+        track_video(options)
+
+
+def test_what_was_guessed_of_a_video_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("cv2")
+    monkeypatch.setattr(video_module, "has_mediapipe", lambda: False)
+    monkeypatch.setattr(video_module, "OwnFinder", _Blind)
+    video = save_video(tmp_path / "wall.mp4", grey_levels(12))
+    with pytest.raises(CaptureError, match="a hand was found in 0 of 2"):
+        capture_video(VideoOptions(video, tmp_path / "out", max_frames=2))
+    notes = json.loads((tmp_path / "out.failed" / "reasons.json").read_text())["notes"]
+    assert "MediaPipe is not installed" in notes[0]
+    assert "2 pictures were taken, up to 0.1 s" in notes[1]
+
+
+class _Blind:
+    """Finds no hands."""
+
+    def __enter__(self) -> "_Blind":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return None
+
+    def track(self, image: np.ndarray) -> list[object]:
+        return []
+
+    def look_closely(self, *_: object) -> None:
+        return None
 
 
 def test_a_hand_wholly_in_the_picture_is_kept_and_known(

@@ -9,7 +9,7 @@ import torch
 from handavatar.capture.checks import CaptureError
 from handavatar.synthetic import lessons
 from handavatar.synthetic.lessons import TrackerTrainOptions, train_made_tracker
-from handavatar.tracker.model import read_tracker
+from handavatar.tracker.model import TrackerError, read_tracker
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TrackerTrainOpti
 
 
 def test_a_training_makes_its_pictures_once_and_goes_on(
-    options: TrackerTrainOptions, monkeypatch: pytest.MonkeyPatch
+    options: TrackerTrainOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # In this process: a spawned one would not know of the smaller files.
     monkeypatch.setattr(lessons, "ProcessPoolExecutor", lambda *_: _Here())
@@ -44,6 +44,15 @@ def test_a_training_makes_its_pictures_once_and_goes_on(
     second = read_tracker(options.out)
     assert torch.equal(first.points.vertices, second.points.vertices)
     assert not torch.equal(first.network.at_point, second.network.at_point)
+    # From given weights; a rate of nothing leaves them.
+    further = replace(options, start=options.out, out=tmp_path / "f.safetensors", rate=1e-9)
+    train_made_tracker(replace(further, steps=1))
+    third = read_tracker(further.out)
+    torch.testing.assert_close(third.network.at_point, second.network.at_point, atol=1e-4, rtol=0)
+    with pytest.raises(TrackerError, match="other points"):
+        monkeypatch.setattr(lessons, "NUM_SKIN_POINTS", 3)
+        train_made_tracker(further)
+    monkeypatch.setattr(lessons, "NUM_SKIN_POINTS", 64)
     options.out.with_suffix(".state").write_bytes(b"nothing")
     with pytest.raises(CaptureError, match="cannot be gone on with"):
         train_made_tracker(replace(options, resume=True))
