@@ -1,6 +1,7 @@
 """The table of registration, on captures with known poses and on a film's truth."""
 
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -153,3 +154,22 @@ def test_a_film_goes_all_the_way(tmp_path: Path) -> None:
     off = {row: figures["vertices_mm"] for row, figures in rows.items()}
     assert all(isinstance(value, float) and 1 < value < 25 for value in off.values())
     assert off["registered"] < off["tracked"]
+
+
+@pytest.mark.slow
+def test_a_film_goes_all_the_way_without_mediapipe(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("cv2")
+    monkeypatch.setitem(sys.modules, "mediapipe.python.solutions.hands", None)
+    film = FilmOptions(
+        "short", 21, 0.2, ("spread", "relaxed"), width=320, height=240, seconds=1.6, fps=10.0
+    )
+    make_film(film, tmp_path / "films")
+    options = RegistrationTableOptions(
+        films=tmp_path / "films", cases=("video",), rows=("registered",)
+    )
+    figures = registration_table(options).cases["video"]["registered"]
+    kept, off = figures["frames_kept"], figures["vertices_mm"]
+    assert isinstance(kept, float) and kept > 0.5
+    assert isinstance(off, float) and 1 < off < 15

@@ -55,6 +55,7 @@ from handavatar.capture.outlines import OutlineMatcher, mask_outline
 from handavatar.capture.registration import register_capture
 from handavatar.capture.tracking import Track
 from handavatar.capture.video import (
+    TrackerChoice,
     VideoOptions,
     capture_video,
     observations_of,
@@ -91,8 +92,10 @@ class RegistrationTableOptions:
     """tracked, fitted, outlines, registered"""
     seeds: tuple[int, ...] = (0,)
     """of the noise, one capture each"""
+    tracker: TrackerChoice = "auto"
+    """who finds the hand of films, as in capture video"""
     keep: Path | None = None
-    """folder of results by clip and row: what lies there is not measured again"""
+    """folder of results by clip, row and tracker: what lies there is not measured again"""
 
     def __post_init__(self) -> None:
         """Refuses cases and rows that there are not."""
@@ -313,11 +316,12 @@ def _film_scores(options: RegistrationTableOptions) -> Iterator[tuple[str, str, 
             make_film(film, options.films)
     for path in paths:
         with tempfile.TemporaryDirectory(prefix="handavatar-bench-") as folder:
-            road = FilmRoad(path, Path(folder))
+            road = FilmRoad(path, Path(folder), options.tracker)
             for row in options.rows:
                 scores = _kept_or_measured(
                     options,
-                    f"video-{path.stem}-{row}",
+                    f"video-{path.stem}-{row}"
+                    + ("" if options.tracker == "auto" else f"-{options.tracker}"),
                     partial(road.scores, row),
                 )
                 if scores is not None:
@@ -350,12 +354,13 @@ class FoundClip:
 class FilmRoad:
     """A made film on its way to a capture; what is slow is done once, when it is first needed."""
 
-    def __init__(self, path: Path, folder: Path) -> None:
+    def __init__(self, path: Path, folder: Path, tracker: TrackerChoice = "auto") -> None:
         """Reads the truth.
 
         Args:
             path: of the film.
             folder: where captures may be written.
+            tracker: who finds the hand.
 
         Raises:
             CaptureError: if the truth is missing or damaged.
@@ -363,7 +368,9 @@ class FilmRoad:
         self.path, self.folder = path, folder
         self.truth = read_film_truth(path)
         # Which hand it is is not in question here.
-        self.options = VideoOptions(path, folder / "fitted", side="right", min_confidence=0.0)
+        self.options = VideoOptions(
+            path, folder / "fitted", side="right", tracker=tracker, min_confidence=0.0
+        )
         self._track: Track | None = None
         self._capture: Capture | None = None
 

@@ -85,6 +85,8 @@ from handavatar.tracker.model import shipped_tracker
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
+TrackerChoice = Literal["auto", "own", "mediapipe", "both"]
+"""Who finds hands and their landmarks in a video."""
 Progress = Callable[[float, str], None]
 """Told the share of the work that is done, in [0, 1], and what is being done."""
 
@@ -131,7 +133,7 @@ class VideoOptions:
     hand: Literal["only", "left", "right", "larger", "both"] = "only"
     """Which of two hands that are seen together is taken; only: there is one; both: two captures,
     OUT-left and OUT-right."""
-    tracker: Literal["auto", "own", "mediapipe", "both"] = "auto"
+    tracker: TrackerChoice = "auto"
     """Who finds the hand and tells where its landmarks are: our own tracker, mediapipe, or both,
     mediapipe finding the hand; auto: both where mediapipe is installed, else our own."""
     size: int | None = None
