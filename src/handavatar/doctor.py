@@ -194,7 +194,9 @@ def _cache_folder() -> Path:
 
 
 def _version(package: str) -> str:
+    # Some have another name where they are installed from: cv2 is opencv-python or a sibling.
+    named = importlib.metadata.packages_distributions().get(package, [package])
     try:
-        return importlib.metadata.version(package)
+        return importlib.metadata.version(named[0])
     except importlib.metadata.PackageNotFoundError:
         return "of unknown version"

@@ -25,6 +25,10 @@ from handavatar.capture.color_spaces import ColorTags, srgb_from_planes, srgb_fr
 # playlists and image patterns name other files or network addresses.
 _DEMUXERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpegts,mpeg,gif,asf,flv,ogg,mxf"
 KINDS = "mp4, mov, mkv, webm, avi, ts or gif"
+# Titles may be in any encoding, and nobody reads them here; from 19 on PyAV takes them as they are.
+_ANY_TITLE: dict[str, Any] = (
+    {} if int(av.__version__.split(".")[0]) >= 19 else {"metadata_errors": "replace"}
+)
 _MAX_BYTES = 8 << 30
 _MAX_PIXELS = 64_000_000
 _MIN_SIDE = 96
@@ -204,8 +208,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
                 file,
                 mode="r",
                 options={"format_whitelist": _DEMUXERS},
-                # Titles may be in any encoding; nobody reads them here.
-                metadata_errors="replace",
+                **_ANY_TITLE,
             )
         except av.error.FFmpegError as error:
             raise CaptureError(
