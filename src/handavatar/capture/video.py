@@ -370,8 +370,8 @@ def track_video(options: VideoOptions, progress: Callable[[int, str], None] | No
     is_own = options.tracker == "own" or (options.tracker == "auto" and not has_mediapipe())
     if is_own and options.tracker == "auto":
         notes.append(
-            "MediaPipe is not installed, so our own tracker alone finds the hand; both together "
-            "are more exact (pip install 'handavatar[video]')"
+            "MediaPipe is not installed, so our own tracker alone finds the hand, less exactly "
+            "(with Python 3.12 or older: pip install 'handavatar[video]')"
         )
     frames = frames_of(options.file, options.sampling(), notes.append)
     try:

@@ -101,7 +101,8 @@ def resampled(
     view = piece.transform(
         (side, side), Image.Transform.AFFINE, coefficients, Image.Resampling.BILINEAR
     )
-    return np.asarray(view)
+    # A copy, which may be written to.
+    return np.array(view)
 
 
 def resized(
