@@ -82,8 +82,8 @@ def test_two_trackers_are_surer_where_they_agree_and_less_sure_where_they_do_not
     ]
     both = with_skin(_seen(places, 2.0), points, torch.tensor([4, 5, 6]), torch.tensor([7, 8, 0]))
     assert both.skin is not None and both.skin.vertices.tolist() == [4, 5, 6]
-    # 2 and 4 pixels (millimetres) here, 3 and 4 there.
-    other, mine = 2**2 + 4**2, 3**2 + 4**2
+    # 2 and 4 pixels (millimetres) here, 3 and 10 there.
+    other, mine = 2**2 + 4**2, 3**2 + 10**2
     least = (1 / (1 / other + 1 / mine)) ** 0.5
     error = both.uncertainty
     assert torch.allclose(error[0], torch.tensor(least), rtol=1e-5)
