@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from videos import CASES, needs_cases
 
-from handavatar.capture.decoding import VideoFrame
+from handavatar.capture.decoding import Sampling, VideoFrame, video_frames
 from handavatar.capture.own_finder import OwnFinder
 from handavatar.capture.skin_points import world_places
 from handavatar.capture.tracking import UnusableTrackError, track_hand
@@ -96,3 +97,21 @@ def test_landmarks_and_depths_become_a_hand_of_the_usual_size() -> None:
         lengths = np.linalg.norm(found - found[0], axis=-1)
         expected = np.linalg.norm(template - template[0], axis=-1) * HAND_SIZE / size
         np.testing.assert_allclose(lengths, expected, rtol=0.02, atol=1e-4)
+
+
+@pytest.mark.slow
+@needs_cases
+def test_one_of_two_real_hands_is_chosen() -> None:
+    """A real hand and its mirror image, side by side."""
+    frames = list(video_frames(CASES / "two_hands.mp4", Sampling(4.0)))
+    with pytest.raises(UnusableTrackError, match="two hands in 11 of 11"):
+        track_hand(frames, finder=OwnFinder())
+    middles = {}
+    for which in ("left", "right"):
+        track = track_hand(frames, which=which, finder=OwnFinder())
+        assert track.side == which and len(track.hands) == 11
+        assert track.votes_right == (which == "right")
+        middles[which] = [float(hand.landmarks[:, 0].mean()) for hand in track.hands]
+    # Each is mirrored to a right hand, and so they lie in the same place.
+    assert np.allclose(middles["left"], middles["right"], atol=40)
+    assert max(middles["right"]) < 640
