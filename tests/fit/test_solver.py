@@ -107,8 +107,10 @@ def test_selected_frames_descend_as_among_others(
     assert torch.equal(part.energies(look), descent.energies(look)[[2, 0]])
     descent.step_poses(look, 2)
     part.step_poses(look, 2)
+    # Frames taken for others would be 0.1 apart; processors round other numbers of systems that are
+    # solved at once differently, by 3e-6 where there is AVX2 alone.
     torch.testing.assert_close(
-        part.poses.rotations, descent.poses.rotations[[2, 0]], rtol=0, atol=1e-6
+        part.poses.rotations, descent.poses.rotations[[2, 0]], rtol=0, atol=1e-5
     )
 
 
