@@ -110,7 +110,7 @@ def test_one_of_two_real_hands_is_chosen() -> None:
     for which in ("left", "right"):
         track = track_hand(frames, which=which, finder=OwnFinder())
         assert track.side == which and len(track.hands) == 11
-        assert track.votes_right == (which == "right")
+        assert abs(track.votes_right - (which == "right")) < 0.1
         middles[which] = [float(hand.landmarks[:, 0].mean()) for hand in track.hands]
     # Each is mirrored to a right hand, and so they lie in the same place.
     assert np.allclose(middles["left"], middles["right"], atol=40)
