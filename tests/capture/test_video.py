@@ -117,12 +117,6 @@ def test_what_was_guessed_of_a_video_is_told(
 class _Blind:
     """Finds no hands."""
 
-    def __enter__(self) -> "_Blind":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
-
     def track(self, image: np.ndarray) -> list[object]:
         return []
 

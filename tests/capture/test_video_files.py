@@ -11,7 +11,7 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
-from videos import CASES, needs_cases, save_sound
+from videos import CASES, add_silence, needs_cases, save_sound
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import Sampling, VideoFrame, video_frames
@@ -119,13 +119,11 @@ class Kind:
     transfer: int = 1
     is_tagged: bool = True
     tolerance: float = 3.0
-    options: str = ""
 
     def __str__(self) -> str:
         return self.name
 
 
-_EXACT = "crf=6"
 _TAGS = [
     Kind(
         f"tags-{matrix}-{'full' if is_full else 'limited'}.mp4",
@@ -398,13 +396,7 @@ def test_sound_that_is_longer_is_no_fault(tmp_path: Path) -> None:
                 frame = av.VideoFrame.from_ndarray(painted(), format="rgb24")
                 container.mux(pictures.encode(frame))
             container.mux(pictures.encode(None))
-            for start in range(0, 48000, 1000):
-                silence = av.AudioFrame.from_ndarray(
-                    np.zeros((1, 1000), dtype=np.float32), format="fltp", layout="mono"
-                )
-                silence.sample_rate, silence.pts = 16000, start
-                container.mux(sound.encode(silence))
-            container.mux(sound.encode(None))
+            add_silence(container, sound, 3.0)
         assert len(list(video_frames(path, Sampling(25.0)))) == 10
 
 

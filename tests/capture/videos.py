@@ -39,15 +39,21 @@ def save_video(
 def save_sound(path: Path) -> Path:
     """Writes half a second of silence."""
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("aac", rate=16000, layout="mono")
-        for start in range(0, 8000, 1000):
-            frame = av.AudioFrame.from_ndarray(
-                np.zeros((1, 1000), dtype=np.float32), format="fltp", layout="mono"
-            )
-            frame.sample_rate, frame.pts = 16000, start
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+        add_silence(container, container.add_stream("aac", rate=16000, layout="mono"), 0.5)
     return path
+
+
+def add_silence(
+    container: av.container.OutputContainer, stream: av.audio.stream.AudioStream, seconds: float
+) -> None:
+    """Fills a stream of 16,000 samples a second, and ends it."""
+    for start in range(0, round(16000 * seconds), 1000):
+        frame = av.AudioFrame.from_ndarray(
+            np.zeros((1, 1000), dtype=np.float32), format="fltp", layout="mono"
+        )
+        frame.sample_rate, frame.pts = 16000, start
+        container.mux(stream.encode(frame))
+    container.mux(stream.encode(None))
 
 
 def grey_levels(count: int, size: tuple[int, int] = (160, 120)) -> list[np.ndarray]:

@@ -10,7 +10,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8, UInt16
+
+from handavatar.geometry.colors import eight_bits, linear_from_srgb, srgb_from_linear
 
 UNSPECIFIED = 2
 _RGB, _BT709, _FCC, _BT470BG, _SMPTE170M = 0, 1, 4, 5, 6
@@ -66,14 +69,12 @@ class ColorTags:
         is_full: whether all numbers are used, or 16 to 235 of 255.
         primaries: of the RGB.
         transfer: from light to its numbers.
-        is_guessed: whether the file says nothing about the matrix.
     """
 
     matrix: int
     is_full: bool
     primaries: int
     transfer: int
-    is_guessed: bool = False
 
     @classmethod
     def of_planes(
@@ -95,13 +96,11 @@ class ColorTags:
             size: width and height: large pictures without tags are BT.709, small ones BT.601.
             is_full_format: whether the format of the pixels says that all numbers are used.
         """
-        is_guessed = matrix in (UNSPECIFIED, _RGB)
-        if is_guessed:
+        if matrix in (UNSPECIFIED, _RGB):
             is_large = size[0] >= 1280 or size[1] > 576
             matrix = _BT2020 if primaries == 9 else _BT709 if is_large else _SMPTE170M
-        return cls(
-            matrix, color_range == _FULL_RANGE or is_full_format, primaries, transfer, is_guessed
-        )
+        is_full = color_range == _FULL_RANGE or is_full_format
+        return cls(matrix, is_full, primaries, transfer)
 
     @property
     def is_high_dynamic_range(self) -> bool:
@@ -227,15 +226,14 @@ def _light_of_steps(transfer: int) -> Float[np.ndarray, "steps"]:
     elif transfer == _DCI:
         light = 52.37 / 48 * signal**2.6
     else:
-        light = np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4)
+        light = linear_from_srgb(torch.from_numpy(signal)).numpy()
     return light.astype(np.float32)
 
 
 @lru_cache(maxsize=1)
 def _srgb_of_steps() -> UInt8[np.ndarray, "steps"]:
-    light = np.linspace(0, 1, _STEPS_OUT + 1)
-    signal = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
-    return (255 * signal + 0.5).astype(np.uint8)
+    light = torch.from_numpy(np.linspace(0, 1, _STEPS_OUT + 1))
+    return eight_bits(srgb_from_linear(light)).numpy()
 
 
 def _rgb_from_planes(matrix: int, primaries: int) -> Float[np.ndarray, "3 3"]:

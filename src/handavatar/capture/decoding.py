@@ -6,7 +6,7 @@ its pixels, times of the frames, edit lists. What had to be guessed, changed or 
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,14 +30,14 @@ _ANY_TITLE: dict[str, Any] = (
     {} if int(av.__version__.split(".")[0]) >= 19 else {"metadata_errors": "replace"}
 )
 _MAX_BYTES = 8 << 30
-_MAX_PIXELS = 64_000_000
+MAX_PIXELS = 64_000_000
+"""Of a picture."""
 _MIN_SIDE = 96
-MAX_WORKING_SIDE = 1920
-"""Pixels of the longer side of the pictures that are looked at."""
+_MAX_WORKING_SIDE = 1920
 # Of what a header promises, and seconds: less is cut short.
 _WHOLE_SHARE, _SLACK = 0.9, 0.2
-SAME_SHAPE = 0.03
-"""Difference of width by height up to which pictures have the same shape."""
+# Difference of width by height up to which pictures have the same shape.
+_SAME_SHAPE = 0.03
 # Degrees from a quarter turn that are nobody's intention.
 _TURN_TOLERANCE = 2.0
 _LONGEST_RATIO = 8.0
@@ -120,14 +120,9 @@ class _Display:
         """Whether it is more than a turn."""
         return self.is_transposed ^ self.is_flipped[0] ^ self.is_flipped[1]
 
-    def stored_size(self, width: int, height: int) -> tuple[float, float]:
+    def stored_size(self, width: int, height: int) -> tuple[int, int]:
         """Width and height with square pixels, before turning; nothing becomes smaller."""
-        return width * max(1.0, self.stretch), height * max(1.0, 1 / self.stretch)
-
-    def shown_size(self, width: int, height: int) -> tuple[float, float]:
-        """Width and height as seen."""
-        size = self.stored_size(width, height)
-        return size[::-1] if self.is_transposed else size
+        return round(width * max(1.0, self.stretch)), round(height * max(1.0, 1 / self.stretch))
 
     def shown(self, image: UInt8[np.ndarray, "_ _ 3"]) -> UInt8[np.ndarray, "_ _ 3"]:
         """Turned and mirrored."""
@@ -142,7 +137,7 @@ class _Scan:
     """What a first reading of a file tells, without decoding more than a few frames a second.
 
     Attributes:
-        size: of pictures as seen; of the largest ones, if it changes.
+        size: in which the pictures are looked at, before they are turned.
         num_sizes: how many different sizes there are.
         end: seconds at which the last picture ends.
         reached: seconds until which there is anything, in what the header speaks of.
@@ -184,6 +179,38 @@ def video_frames(
         scan = _scanned(path, container, stream)
     with _opened(path) as (container, stream):
         yield from _Decoder(path, container, stream, scan, sampling, tell).frames()
+
+
+def check_size(path: Path, width: int, height: int) -> None:
+    """Refuses pictures that are too small to show a hand, or too large to be read.
+
+    Raises:
+        CaptureError: what they are and what was expected.
+    """
+    if not (min(width, height) >= _MIN_SIDE and width * height <= MAX_PIXELS):
+        raise CaptureError(
+            f"{path}: pictures of {width} x {height} pixels; expected at least {_MIN_SIDE} on the "
+            f"short side and at most {MAX_PIXELS // 1_000_000} megapixels",
+            "record or convert it at a common size such as 1280 x 720",
+        )
+
+
+def have_same_shape(first: tuple[int, int], second: tuple[int, int]) -> bool:
+    """Whether two widths and heights differ by no more than a factor, nearly."""
+    return abs(first[0] / first[1] * second[1] / second[0] - 1) <= _SAME_SHAPE
+
+
+def working_size(sizes: Iterable[tuple[int, int]]) -> tuple[int, int]:
+    """Width and height in which pictures of several sizes are looked at: the largest, bounded."""
+    width, height = max(sizes, key=lambda size: (size[0] * size[1], size))
+    scale = min(1.0, _MAX_WORKING_SIDE / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def say_other_shapes(count: int, tell: Tell) -> None:
+    """Tells how many pictures were left out because they are wider or higher than the others."""
+    if count:
+        tell(f"{count} pictures were left out: their width by height is not that of the others")
 
 
 def _check_file(path: Path) -> None:
@@ -240,10 +267,10 @@ def _stream_kinds(container: Any) -> str:
 def _scanned(path: Path, container: Any, stream: Any) -> _Scan:
     """Reads all packets, and decodes key frames that are not too close to each other."""
     context = stream.codec_context
-    _check_size(path, context.width, context.height)
+    check_size(path, context.width, context.height)
     ends = {other.index: 0.0 for other in container.streams}
     firsts: dict[int, float] = {}
-    sizes: dict[tuple[int, int], float] = {}
+    sizes: set[tuple[int, int]] = set()
     context.skip_frame = "NONKEY"
     due = -math.inf
     try:
@@ -258,46 +285,28 @@ def _scanned(path: Path, container: Any, stream: Any) -> _Scan:
             ends[index] = max(ends[index], time + length)
             if index == stream.index and packet.is_keyframe and time >= due:
                 due = time + _SCAN_STEP
-                _note_sizes(sizes, packet.decode(), stream)
-        _note_sizes(sizes, context.decode(None), stream)
+                sizes.update(_square_size(frame, stream) for frame in packet.decode())
+        sizes.update(_square_size(frame, stream) for frame in context.decode(None))
     except av.error.FFmpegError:
         # Said when it is met again, after all pictures before it.
         pass
-    if not sizes:
-        sizes = {(context.width, context.height): _pixel_stretch(stream)}
-    shown = {
-        tuple(round(side) for side in replace(_Display(), stretch=stretch).stored_size(*size))
-        for size, stretch in sizes.items()
-    }
-    for width, height in shown:
-        _check_size(path, width, height)
+    sizes = sizes or {_square_size(context, stream)}
+    for width, height in sizes:
+        check_size(path, width, height)
     end = ends[stream.index] - firsts.get(stream.index, 0.0)
     if stream.duration is not None and stream.time_base is not None:
         promised = float(stream.duration * stream.time_base)
-        return _Scan(_largest(shown), len(shown), end, end, promised)
+        return _Scan(working_size(sizes), len(sizes), end, end, promised)
     # Then the header speaks of the longest of pictures and sound.
     reached = max(ends.values()) - min(firsts.values(), default=0.0)
     of_all = None if container.duration is None else container.duration / av.time_base
-    return _Scan(_largest(shown), len(shown), end, reached, of_all)
+    return _Scan(working_size(sizes), len(sizes), end, reached, of_all)
 
 
-def _check_size(path: Path, width: int, height: int) -> None:
-    if not (min(width, height) >= _MIN_SIDE and width * height <= _MAX_PIXELS):
-        raise CaptureError(
-            f"{path}: pictures of {width} x {height} pixels; expected at least {_MIN_SIDE} on the "
-            f"short side and at most {_MAX_PIXELS // 1_000_000} megapixels",
-            "record or convert it at a common size such as 1280 x 720",
-        )
-
-
-def _note_sizes(sizes: dict[tuple[int, int], float], frames: list[Any], stream: Any) -> None:
-    for frame in frames:
-        sizes[frame.width, frame.height] = _pixel_stretch(stream)
-
-
-def _largest(sizes: set[tuple[int, ...]]) -> tuple[int, int]:
-    width, height = max(sizes, key=lambda size: (size[0] * size[1], size))
-    return width, height
+def _square_size(picture: Any, stream: Any) -> tuple[int, int]:
+    """Width and height of a stored picture whose pixels have become squares."""
+    display = _Display(stretch=_pixel_stretch(stream))
+    return display.stored_size(picture.width, picture.height)
 
 
 def _pixel_stretch(stream: Any) -> float:
@@ -350,11 +359,7 @@ class _Decoder:
                 f"the pictures' size changes ({self.scan.num_sizes} sizes): all are brought to "
                 f"{self.scan.size[0]} x {self.scan.size[1]}"
             )
-        if self.num_other_shapes:
-            self.say(
-                f"{self.num_other_shapes} pictures were left out: their width by height is not "
-                "that of the others"
-            )
+        say_other_shapes(self.num_other_shapes, self.say)
 
     def say(self, text: str) -> None:
         """Tells it, once."""
@@ -422,17 +427,13 @@ class _Decoder:
     def image(self, frame: Any) -> UInt8[np.ndarray, "height width 3"] | None:
         """Upright, with square pixels, in sRGB; None if its shape is not that of the others."""
         display = self.display(frame)
-        shown = display.shown_size(frame.width, frame.height)
-        width, height = self.scan.size[::-1] if display.is_transposed else self.scan.size
         if self.is_transposed is None:
             self.is_transposed = display.is_transposed
-        is_other = abs(shown[0] / shown[1] * height / width - 1) > SAME_SHAPE
-        if is_other or display.is_transposed != self.is_transposed:
+        stored = display.stored_size(frame.width, frame.height)
+        is_same = have_same_shape(stored, self.scan.size)
+        if not is_same or display.is_transposed != self.is_transposed:
             return None
-        scale = min(1.0, MAX_WORKING_SIDE / max(self.scan.size))
-        size = tuple(max(1, round(side * scale)) for side in self.scan.size)
-        image = self.srgb(frame, (size[0], size[1]))
-        return display.shown(image)
+        return display.shown(self.srgb(frame, self.scan.size))
 
     def srgb(self, frame: Any, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 3"]:
         """As stored, in sRGB."""

@@ -154,16 +154,14 @@ def with_skin(
     points: Sequence[SeenPoints],
     vertices: Int[Tensor, "skin"],
     nearest: Int[Tensor, "skin"],
-    is_alone: bool = False,
 ) -> Observations:
     """Landmarks of both trackers in one, each as far as it is sure, and our own's skin and depths.
 
     Args:
-        seen: by the other tracker.
+        seen: by the other tracker; landmarks that are infinitely unsure count nothing.
         points: by our own, in the same frames.
         vertices: of the rig, which points behind the landmarks are; of another rig none.
         nearest: landmark of each of them: where that is contradicted, so is the skin.
-        is_alone: whether ours is the only tracker, and ``seen`` says its landmarks again.
     """
 
     def stacked(name: str) -> Tensor:
@@ -175,8 +173,6 @@ def with_skin(
     other = seen.uncertainty.hypot(LANDMARK_ERROR * scale)
     errors = stacked("errors").hypot(OWN_ERROR * scale)
     apart = places[:, :count] - seen.landmarks
-    if is_alone:
-        apart, other = torch.zeros_like(apart), torch.full_like(other, torch.inf)
     factors = contradiction(apart, errors[:, :count], other)
     factors = torch.cat([factors, factors[:, nearest]], dim=1)
     depth_errors = factors * (HAND_SIZE * stacked("depth_errors")).hypot(

@@ -12,7 +12,11 @@ from handavatar.capture.decoding import Tell
 from handavatar.capture.frames import Capture, read_capture
 from handavatar.capture.motion import MAX_STEPS, Motion
 from handavatar.capture.video import VideoOptions, capture_video
-from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from handavatar.geometry.rotations import (
+    axis_angle_from_matrix,
+    matrix_from_axis_angle,
+    rotations_between,
+)
 
 _LONG_GAP = 0.75
 """Seconds without a pose that are told."""
@@ -96,7 +100,6 @@ def motion_of_capture(capture: Capture, fps: float | None, tell: Tell) -> Motion
     rotations = torch.stack([record.pose.rotations for record in records]).float()
     translations = torch.stack([record.pose.translation for record in records]).float()
     matrices = matrix_from_axis_angle(rotations)
-    turns = axis_angle_from_matrix(matrices[after - 1].mT @ matrices[after])
-    between = matrices[after - 1] @ matrix_from_axis_angle(share[:, None, None] * turns)
+    between = rotations_between(matrices[after - 1], matrices[after], share[:, None, None])
     places = torch.lerp(translations[after - 1], translations[after], share[:, None])
     return Motion(rate, axis_angle_from_matrix(between), places)

@@ -9,13 +9,12 @@ where it is. From then on a hand is looked for where it was in the picture befor
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from types import TracebackType
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
 
-from handavatar.capture.skin_points import world_places
+from handavatar.capture.skin_points import Look, world_places
 from handavatar.capture.tracking import Sighting
 from handavatar.capture.windows import resampled
 from handavatar.hand.landmarks import NUM_LANDMARKS
@@ -29,6 +28,8 @@ _OF_EACH_SIZE = 3
 _ROUNDS_OF_SEARCH, _ROUNDS_OF_FOLLOWING = 4, 2
 _ROOM = 1.35
 """Side of a crop in units of the box of what was seen of the hand in the one before."""
+_LEAST_SIDE = 8.0
+"""Pixels of the picture, where all that was seen falls together."""
 _NEAR = 0.07
 """Shares of a crop's side within which pixels of a hand are near one of its points."""
 _MOST_ERROR, _MOST_MOTION, _LEAST_PRESENCE = 0.12, 0.04, 0.997
@@ -47,24 +48,6 @@ its vote to count fully."""
 _UNCLEAR_VOTE = 0.2
 
 
-@dataclass(frozen=True)
-class _Look:
-    """A crop to be asked: middle and side in pixels of the picture, turn in radians."""
-
-    middle: tuple[float, float]
-    side: float
-    turn: float
-    is_mirrored: bool
-
-    def picture_from_crop(self) -> tuple[Float[np.ndarray, "2 2"], Float[np.ndarray, "2"]]:
-        """Matrix and corner that bring pixels of the crop to the picture."""
-        cos, sin = math.cos(self.turn), math.sin(self.turn)
-        matrix = np.array([[cos, -sin], [sin, cos]]) * (self.side / INPUT_SIDE)
-        if self.is_mirrored:
-            matrix = matrix @ np.diag([-1.0, 1.0])
-        return matrix, np.array(self.middle) - matrix @ np.full(2, INPUT_SIDE / 2)
-
-
 @dataclass(frozen=True, eq=False)
 class _Seen:
     """What the network saw in a look.
@@ -81,7 +64,7 @@ class _Seen:
         motion: of the points since the look before, in units of the crop's side.
     """
 
-    look: _Look
+    look: Look
     points: Float[np.ndarray, "points 2"]
     depths: Float[np.ndarray, "points"]
     error: float
@@ -117,39 +100,24 @@ class _Seen:
             + 0.3 * math.log2(self.look.side / short_side)
         )
 
-    def again(self) -> _Look:
+    def again(self) -> Look:
         """The upright crop about all that was seen of the hand."""
         # Of a left hand in the mirror, in which it is a right one.
         flip = np.array([-1.0 if self.look.is_mirrored else 1.0, 1.0])
-        turn = float(upright_turn(torch.from_numpy(self.points[None] * flip))[0]) * flip[0]
-        axes = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
-        turned = np.concatenate([self.points, self.hand]) @ axes
-        low, high = turned.min(0), turned.max(0)
-        x, y = axes @ ((low + high) / 2)
-        side = float((high - low).max()) * _ROOM
-        return _Look((float(x), float(y)), max(side, 8.0), float(turn), self.look.is_mirrored)
+        turn = float(upright_turn(torch.from_numpy(self.points[None] * flip))[0] * flip[0])
+        places = np.concatenate([self.points, self.hand])
+        look = Look.about(places, turn, _ROOM, self.look.is_mirrored)
+        return replace(look, side=max(look.side, _LEAST_SIDE))
 
 
 class OwnFinder:
-    """Finds up to two hands in the pictures of a video; a context manager, as ``HandFinder``."""
+    """Finds up to two hands in the pictures of a video."""
 
     def __init__(self, tracker: TrainedTracker | None = None) -> None:
         """Takes the tracker that ships, or another."""
         self._tracker = tracker or shipped_tracker()
-        self._last: list[_Look] = []
+        self._last: list[Look] = []
         self._without = 0
-
-    def __enter__(self) -> "OwnFinder":
-        """Itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Nothing is held."""
 
     def track(self, image: UInt8[np.ndarray, "height width 3"]) -> list[Sighting]:
         """All hands of the next picture of a video."""
@@ -181,14 +149,14 @@ class OwnFinder:
         low, high = around.min(0), around.max(0)
         x, y = (low + high) / 2
         side = float((high - low).max()) * 1.5
-        looks = [_Look((float(x), float(y)), side, upright + turn, flip) for flip in (False, True)]
+        looks = [Look((float(x), float(y)), side, upright + turn, flip) for flip in (False, True)]
         first, second = sorted(self._ask(image, looks), key=lambda seen: -seen.right)
         if not _is_followed(first, image):
             return None
         return self._sighting(first, second)
 
     def _followed(
-        self, image: UInt8[np.ndarray, "height width 3"], look: _Look
+        self, image: UInt8[np.ndarray, "height width 3"], look: Look
     ) -> tuple[_Seen, _Seen] | None:
         looks = [look, replace(look, is_mirrored=not look.is_mirrored)]
         pair = self._refined(image, looks, _ROUNDS_OF_FOLLOWING)
@@ -224,7 +192,7 @@ class OwnFinder:
         return apart[:1] + [pair for pair in apart[1:2] if pair[0].vagueness <= _SECOND_ERROR]
 
     def _refined(
-        self, image: UInt8[np.ndarray, "height width 3"], looks: Sequence[_Look], rounds: int
+        self, image: UInt8[np.ndarray, "height width 3"], looks: Sequence[Look], rounds: int
     ) -> list[_Seen]:
         seen = self._ask(image, looks)
         for _ in range(rounds):
@@ -243,7 +211,7 @@ class OwnFinder:
         return seen
 
     def _ask(
-        self, image: UInt8[np.ndarray, "height width 3"], looks: Sequence[_Look]
+        self, image: UInt8[np.ndarray, "height width 3"], looks: Sequence[Look]
     ) -> list[_Seen]:
         placed = [look.picture_from_crop() for look in looks]
         crops = [resampled(image, matrix, corner, INPUT_SIDE) for matrix, corner in placed]
@@ -293,13 +261,13 @@ def _is_followed(seen: _Seen, image: UInt8[np.ndarray, "height width 3"]) -> boo
     return is_hand and seen.vagueness <= _MOST_ERROR_FOLLOWED and _is_large(seen, image)
 
 
-def _looks_all_over(width: int, height: int) -> list[_Look]:
+def _looks_all_over(width: int, height: int) -> list[Look]:
     """Crops of every size that overlap by half."""
     looks = []
     for share in _SIZES:
         side = share * min(width, height)
         columns, rows = (_middles(length, side) for length in (width, height))
-        looks += [_Look((x, y), side, 0.0, False) for y in rows for x in columns]
+        looks += [Look((x, y), side, 0.0) for y in rows for x in columns]
     return looks
 
 

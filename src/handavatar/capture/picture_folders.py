@@ -11,12 +11,15 @@ from PIL import Image, ImageCms, ImageOps
 
 from handavatar.capture.checks import CaptureError, decoded, picture_in
 from handavatar.capture.decoding import (
-    MAX_WORKING_SIDE,
-    SAME_SHAPE,
+    MAX_PIXELS,
     Sampling,
     Tell,
     VideoFrame,
+    check_size,
+    have_same_shape,
+    say_other_shapes,
     video_frames,
+    working_size,
 )
 
 _FORMATS = {
@@ -30,8 +33,6 @@ _FORMATS = {
     ".ppm": "PPM",
 }
 _OPTIONAL = {".heic": "HEIF", ".heif": "HEIF"}
-_MAX_PIXELS = 64_000_000
-_MIN_SIDE = 96
 _COUNTED = re.compile(r"%0?(\d*)d")
 
 
@@ -68,19 +69,11 @@ def picture_frames(source: Path, sampling: Sampling, tell: Tell) -> Iterator[Vid
     files = _picture_files(source, tell)
     tell(f"pictures tell no times: they are taken as {sampling.fps:g} a second (--fps)")
     sizes = [_upright_size(file) for file in files]
-    largest = max(sizes, key=lambda size: size[0] * size[1])
-    is_same = [abs(w * largest[1] / (h * largest[0]) - 1) <= SAME_SHAPE for w, h in sizes]
-    if not all(is_same):
-        tell(
-            f"{is_same.count(False)} pictures were left out: their width by height is not that "
-            "of the others"
-        )
+    width, height = working_size(sizes)
+    is_same = [have_same_shape(size, (width, height)) for size in sizes]
+    say_other_shapes(is_same.count(False), tell)
     if len(set(sizes)) > 1:
-        tell(
-            f"pictures have {len(set(sizes))} sizes: all are brought to {largest[0]} x {largest[1]}"
-        )
-    scale = min(1.0, MAX_WORKING_SIDE / max(largest))
-    width, height = (max(1, round(side * scale)) for side in largest)
+        tell(f"pictures have {len(set(sizes))} sizes: all are brought to {width} x {height}")
     taken = 0
     for number, (file, is_kept) in enumerate(zip(files, is_same, strict=True)):
         time = number / sampling.fps
@@ -149,18 +142,13 @@ def _opened(file: Path) -> Image.Image:
         register_heif_opener()
     # A file may be of another kind than its name says.
     kinds = tuple(sorted({*_FORMATS.values(), (_FORMATS | _OPTIONAL)[suffix]}))
-    return picture_in(file, str(file), kinds, _MAX_PIXELS)
+    return picture_in(file, str(file), kinds, MAX_PIXELS)
 
 
 def _upright_size(file: Path) -> tuple[int, int]:
     with _opened(file) as picture:
         width, height = picture.size
-        if min(width, height) < _MIN_SIDE:
-            raise CaptureError(
-                f"{file}: {width} x {height} pixels; expected at least {_MIN_SIDE} on the short "
-                "side",
-                "give larger pictures",
-            )
+        check_size(file, width, height)
         is_turned = picture.getexif().get(0x0112) in (5, 6, 7, 8)
     return (height, width) if is_turned else (width, height)
 

@@ -19,6 +19,57 @@ _LOOKS = ((0.0, 1.45), (math.radians(20), 1.55), (math.radians(-20), 1.35))
 """Turn of a crop from where the hand is upright, and its side in units of the hand's box."""
 
 
+@dataclass(frozen=True)
+class Look:
+    """A crop that the tracker is asked about.
+
+    Attributes:
+        middle: of the crop, pixels of the picture.
+        side: of the crop, pixels of the picture.
+        turn: radians by which it is turned.
+        is_mirrored: whether a left hand is looked at as a right one.
+    """
+
+    middle: tuple[float, float]
+    side: float
+    turn: float
+    is_mirrored: bool = False
+
+    @classmethod
+    def about(
+        cls,
+        places: Float[np.ndarray, "places 2"],
+        turn: float,
+        room: float,
+        is_mirrored: bool = False,
+    ) -> "Look":
+        """The turned square about places of a picture.
+
+        Args:
+            places: pixels.
+            turn: radians.
+            room: side in units of the longer side of the turned box about the places.
+            is_mirrored: whether a left hand is looked at as a right one.
+        """
+        axes = _turned_axes(turn)
+        turned = places @ axes
+        low, high = turned.min(0), turned.max(0)
+        x, y = axes @ ((low + high) / 2)
+        return cls((float(x), float(y)), float((high - low).max()) * room, turn, is_mirrored)
+
+    def picture_from_crop(self) -> tuple[Float[np.ndarray, "2 2"], Float[np.ndarray, "2"]]:
+        """Matrix and corner that bring pixels of the crop to the picture."""
+        matrix = _turned_axes(self.turn) * (self.side / INPUT_SIDE)
+        if self.is_mirrored:
+            matrix = matrix @ np.diag([-1.0, 1.0])
+        return matrix, np.array(self.middle) - matrix @ np.full(2, INPUT_SIDE / 2)
+
+
+def _turned_axes(turn: float) -> Float[np.ndarray, "2 2"]:
+    cos, sin = math.cos(turn), math.sin(turn)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
 @dataclass(frozen=True, eq=False)
 class SeenPoints:
     """Points of a right hand in a picture.
@@ -61,27 +112,18 @@ def see_points(
     """
     around = window.from_picture(landmarks)
     upright = float(upright_turn(torch.from_numpy(around)[None])[0])
-    crops, places_in, sides = [], [], []
-    for turn, share in _LOOKS:
-        cos, sin = math.cos(upright + turn), math.sin(upright + turn)
-        axes = np.array([[cos, -sin], [sin, cos]])
-        turned = around @ axes
-        low, high = turned.min(0), turned.max(0)
-        side = float((high - low).max()) * share
-        window_from_crop = axes * (side / INPUT_SIDE)
-        corner = axes @ ((low + high) / 2 - side / 2)
-        crops.append(resampled(window.image, window_from_crop, corner, INPUT_SIDE))
-        places_in.append((window_from_crop * INPUT_SIDE, corner))
-        sides.append(side / window.scale)
-    told = tracker.tell(np.stack(crops))
-    found = told.places.double().numpy()
+    looks = [Look.about(around, upright + turn, room) for turn, room in _LOOKS]
+    placed = [look.picture_from_crop() for look in looks]
+    told = tracker.tell(np.stack([resampled(window.image, *place, INPUT_SIDE) for place in placed]))
+    found = INPUT_SIDE * told.places.double().numpy()
     places = np.stack(
         [
             (place @ matrix.T + corner) / window.scale + np.array(window.corner)
-            for place, (matrix, corner) in zip(found, places_in, strict=True)
+            for place, (matrix, corner) in zip(found, placed, strict=True)
         ]
     )
-    errors = told.place_errors.double().numpy() * np.array(sides)[:, None]
+    sides = np.array([look.side for look in looks]) / window.scale
+    errors = told.place_errors.double().numpy() * sides[:, None]
     place, error = _combined(places, errors)
     depth, depth_error = _combined(
         told.depths.double().numpy()[..., None], told.depth_errors.double().numpy()
@@ -116,10 +158,9 @@ def world_places(
 def _knuckle_distances(rig_name: str) -> Float[np.ndarray, "knuckles"]:
     """From the wrist, on the template of a rig, in units of the hand's size."""
     rig = load_rig(rig_name)
-    places = TrackedPoints.of(rig, 0).template_places(rig)
-    lengths: Float[np.ndarray, knuckles]
-    lengths = (places[list(KNUCKLES)] - places[0]).norm(dim=-1).double().numpy()
-    return lengths / float((places[MIDDLE_KNUCKLE] - places[0]).norm())
+    places = TrackedPoints.of(rig, 0).template_places(rig).double().numpy()
+    lengths = np.linalg.norm(places - places[0], axis=-1)
+    return lengths[list(KNUCKLES)] / lengths[MIDDLE_KNUCKLE]
 
 
 def _combined(

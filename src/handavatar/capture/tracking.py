@@ -7,6 +7,7 @@ by 35 degrees either way. Their median is steadier than any one of them, and whe
 
 import math
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -178,20 +179,7 @@ class UnusableTrackError(CaptureError):
 
 @runtime_checkable
 class Finder(Protocol):
-    """What finds hands in the pictures of a video; a context manager."""
-
-    def __enter__(self) -> "Finder":
-        """Itself."""
-        ...
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Ends it."""
-        ...
+    """What finds hands in the pictures of a video."""
 
     def track(self, image: UInt8[np.ndarray, "height width 3"]) -> list[Sighting]:
         """All hands of the next picture of a video."""
@@ -296,8 +284,9 @@ def track_hand(
             only one is asked for.
         CaptureError: mediapipe is missing.
     """
-    with finder or HandFinder() as opened:
-        seen, glances, picture_size = _all_hands(opened, frames, which != "only", progress)
+    opened = HandFinder() if finder is None else nullcontext(finder)
+    with opened as used:
+        seen, glances, picture_size = _all_hands(used, frames, which != "only", progress)
     if which == "only":
         hands, votes, skipped = _only_hand(seen, side)
     else:
@@ -411,15 +400,13 @@ def _chosen_hand(
 ) -> tuple[list[TrackedHand], list[float], dict[int, str]]:
     """One of two hands: as :func:`_only_hand`."""
     followed = _follow(looked)
+    right, left = (
+        [one for one in followed if (one.vote >= 0) == is_right] for is_right in (True, False)
+    )
     if which == "larger":
-        sizes = {
-            sign: sum(one.size for one in followed if (one.vote >= 0) == (sign > 0))
-            for sign in (1, -1)
-        }
-        sign = max(sizes, key=lambda key: sizes[key])
+        chosen = max(right, left, key=lambda side: sum(one.size for one in side))
     else:
-        sign = 1 if which == "right" else -1
-    chosen = [one for one in followed if (one.vote >= 0) == (sign > 0)]
+        chosen = right if which == "right" else left
     by_index: dict[int, _SeenHand] = {}
     # Where two are taken for the same side, the one that is followed longer.
     for one in sorted(chosen, key=lambda one: -len(one.seen)):

@@ -490,10 +490,13 @@ def observations_of(track: Track) -> Observations:
     points = [hand.points for hand in track.hands if hand.points is not None]
     if len(points) < len(track.hands):
         return seen
+    if track.is_own:
+        # What our tracker has found is what it says again.
+        seen = replace(seen, uncertainty=torch.full_like(seen.uncertainty, torch.inf))
     tracked = shipped_tracker().points
     num_skin = len(points[0].places) - NUM_LANDMARKS
     nearest = tracked.nearest_landmarks(load_rig(tracked.rig_name))[:num_skin]
-    return with_skin(seen, points, tracked.vertices[:num_skin], nearest, track.is_own)
+    return with_skin(seen, points, tracked.vertices[:num_skin], nearest)
 
 
 def _seen_by_finder(track: Track) -> Observations:

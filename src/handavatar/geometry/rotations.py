@@ -86,6 +86,22 @@ def axis_angle_from_matrix(matrix: Float[Tensor, "*batch 3 3"]) -> Float[Tensor,
     return ratio * xyz
 
 
+def rotations_between(
+    first: Float[Tensor, "*batch 3 3"],
+    second: Float[Tensor, "*batch 3 3"],
+    share: Float[Tensor, "*parts"] | float,
+) -> Float[Tensor, "*batch 3 3"]:
+    """Rotations part of the shortest way from one to another.
+
+    Args:
+        first: where ``share`` is 0.
+        second: where it is 1.
+        share: of the way, as it is multiplied with axis-angle vectors.
+    """
+    turn = axis_angle_from_matrix(first.transpose(-1, -2) @ second)
+    return first @ matrix_from_axis_angle(share * turn)
+
+
 def nearest_rotations(
     rotations: Float[Tensor, "*n 3"], reference: Float[Tensor, "*#n 3"]
 ) -> Float[Tensor, "*n 3"]:

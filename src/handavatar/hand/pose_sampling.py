@@ -19,7 +19,11 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from handavatar.geometry.meshes import unique_edges
-from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from handavatar.geometry.rotations import (
+    axis_angle_from_matrix,
+    matrix_from_axis_angle,
+    rotations_between,
+)
 from handavatar.hand.pose import BONE_NAMES, BONE_PARENTS, FINGER_BONES, NUM_BONES, HandPose
 from handavatar.hand.rig import Rig
 
@@ -461,7 +465,6 @@ def interpolate_rotations(
     share = clamped - start
     share = share * share * (3 - 2 * share)
     matrices = matrix_from_axis_angle(keyframes)
-    turn = axis_angle_from_matrix(matrices[start].transpose(-1, -2) @ matrices[end])
     return axis_angle_from_matrix(
-        matrices[start] @ matrix_from_axis_angle(share[:, None, None] * turn)
+        rotations_between(matrices[start], matrices[end], share[:, None, None])
     )

@@ -18,7 +18,11 @@ from torch import Tensor
 
 from handavatar.geometry.closest import closest_on_mesh
 from handavatar.geometry.meshes import uniform_laplacian_matrix, unique_edges
-from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from handavatar.geometry.rotations import (
+    axis_angle_from_matrix,
+    matrix_from_axis_angle,
+    rotations_between,
+)
 from handavatar.hand.detail import subdivided
 from handavatar.hand.pose import FINGER_BONES, bone_transforms
 from handavatar.hand.pose_sampling import sample_poses
@@ -262,8 +266,7 @@ def recombined_poses(
 
     start, end = composed(), composed()
     share = torch.rand(count, 1, 1, generator=generator)
-    turn = share * axis_angle_from_matrix(start.transpose(-1, -2) @ end)
-    return axis_angle_from_matrix(start @ matrix_from_axis_angle(turn))
+    return axis_angle_from_matrix(rotations_between(start, end, share))
 
 
 def posed_by(

@@ -24,7 +24,11 @@ from handavatar.capture.motion import MOTIONS, Motion, gesture, placed
 from handavatar.capture.synthetic import SynthOptions, make_subject
 from handavatar.geometry.cameras import Camera, project
 from handavatar.geometry.colors import srgb_from_linear
-from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from handavatar.geometry.rotations import (
+    axis_angle_from_matrix,
+    matrix_from_axis_angle,
+    rotations_between,
+)
 from handavatar.hand.detail import subdivided
 from handavatar.hand.pose import FINGER_BONES, HandPose
 from handavatar.hand.pose_sampling import (
@@ -47,7 +51,6 @@ _SHADOW_STEP = 4
 # Fingers up, palm to the camera, of a hand whose fingers lie along -x and whose back is +y.
 _PALM_VIEW = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 _NOT_YET_SMOOTH = 0.7
-# BT.709 in the numbers of ITU-T H.273.
 
 
 @dataclass(frozen=True)
@@ -418,8 +421,7 @@ def _pose_between(motion: Motion, time: float) -> HandPose:
     if share == 0:
         return motion.pose(start)
     first, second = (matrix_from_axis_angle(motion.rotations[step]) for step in (start, end))
-    turn = axis_angle_from_matrix(first.mT @ second)
     return HandPose(
-        axis_angle_from_matrix(first @ matrix_from_axis_angle(share * turn)),
+        axis_angle_from_matrix(rotations_between(first, second, share)),
         torch.lerp(motion.translations[start], motion.translations[end], share),
     )
