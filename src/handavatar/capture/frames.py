@@ -594,7 +594,7 @@ def _record(
 
 
 def _clip(entry: dict[str, Any]) -> int:
-    clip = number(entry.get("clip", 0), "clip", 0, MAX_CLIPS - 1)
+    clip = number(entry.get("clip", 0), "clip", 0.0, float(MAX_CLIPS - 1))
     if clip != int(clip):
         raise CaptureError(f"clip is {clip:g}, expected a whole number", "number the clips from 0")
     return int(clip)
