@@ -406,7 +406,7 @@ class FilmRoad:
             mask_outline(find_mask(hand, colors).pixels, hand.window, float(scale))
             for hand, scale in zip(hands, seen.scale, strict=True)
         ]
-        return OutlineMatcher(self.truth.rig, outlines, self.track().picture_size)
+        return OutlineMatcher(self.truth.rig, outlines, seen.principal_point)
 
     def _tried(self) -> int:
         """Pictures that were looked at."""

@@ -99,6 +99,7 @@ class Observations:
         scale: picture pixels per metre at the hand.
         times: seconds.
         picture_size: width and height, pixels.
+        principal_point: of the camera, pixels.
         skin: what our own tracker sees beside them; None where it was not asked.
     """
 
@@ -108,6 +109,7 @@ class Observations:
     scale: Float[Tensor, "frames"]
     times: Float[Tensor, "frames"]
     picture_size: tuple[int, int]
+    principal_point: tuple[float, float]
     skin: SkinObservations | None = None
 
     def chosen(self, frames: Int[Tensor, "chosen"]) -> "Observations":
@@ -119,6 +121,7 @@ class Observations:
             self.scale[frames],
             self.times[frames],
             self.picture_size,
+            self.principal_point,
             None if self.skin is None else self.skin.chosen(frames),
         )
 
@@ -347,7 +350,7 @@ def initial_fit(model: HandModel, observations: Observations, options: FitOption
 
 def placed(model: HandModel, observations: Observations, fit: HandFit) -> HandFit:
     """The same poses, moved (not turned) to where the 2D landmarks are; least squares."""
-    center = torch.tensor(observations.picture_size) / 2
+    center = torch.tensor(observations.principal_point)
     points = model.landmarks(replace(fit, translation=torch.zeros_like(fit.translation)))
     rays = (observations.landmarks - center) / fit.log_focal.exp()
     one, zero = torch.ones_like(rays[..., 0]), torch.zeros_like(rays[..., 0])
@@ -446,7 +449,7 @@ def landmark_errors(
     model: HandModel, observations: Observations, fit: HandFit
 ) -> Float[Tensor, "frames"]:
     """Mean distance of fitted and tracked landmarks in every frame, pixels."""
-    seen = projected(model.landmarks(fit), fit.log_focal.exp(), observations.picture_size)
+    seen = projected(model.landmarks(fit), fit.log_focal.exp(), observations.principal_point)
     return (seen - observations.landmarks).norm(dim=-1).mean(-1)
 
 
@@ -460,7 +463,7 @@ def _frame_energy(
     """What each frame's own observations and the limits of its joints say."""
     focal = fit.log_focal.exp()
     landmarks = model.landmarks(fit)
-    apart = projected(landmarks, focal, observations.picture_size) - observations.landmarks
+    apart = projected(landmarks, focal, observations.principal_point) - observations.landmarks
     expected = torch.hypot(
         observations.uncertainty, options.landmark_error * observations.scale[:, None]
     )
@@ -484,7 +487,7 @@ def _outline_energy(
     pairs: OutlinePairs,
 ) -> Float[Tensor, "frames"]:
     points = model.vertices(fit, pairs.vertices)
-    seen = projected(points, fit.log_focal.exp(), observations.picture_size)
+    seen = projected(points, fit.log_focal.exp(), observations.principal_point)
     apart = seen - pairs.targets
     across = (apart * pairs.normals).sum(-1)
     along = apart[..., 0] * pairs.normals[..., 1] - apart[..., 1] * pairs.normals[..., 0]

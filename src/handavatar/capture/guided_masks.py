@@ -37,7 +37,6 @@ from handavatar.capture.masks import (
 )
 from handavatar.capture.outlines import silhouette
 from handavatar.capture.tracking import TrackedHand
-from handavatar.capture.windows import window_camera
 from handavatar.geometry.cameras import project
 from handavatar.hand.rig import Rig
 
@@ -130,8 +129,7 @@ def placed_mesh(
         hand: whose window is meant.
     """
     window = hand.window
-    side = window.image.shape[0]
-    camera = window_camera(focal, window.picture_size, window.corner, side / window.scale, side)
+    camera = window.camera(focal)
     places = project(camera, vertices)[0].double().numpy()
     scale = camera.focal[0] / max(float(vertices[:, 2].median()), 0.02)
     line = wrist_line(places[rig.rim.numpy()], places.mean(0))

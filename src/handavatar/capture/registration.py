@@ -17,7 +17,7 @@ from handavatar.capture.fitting import LANDMARK_ERROR, Observations
 from handavatar.capture.frames import FITTED_SIDE, LANDMARKS, Capture, Frame
 from handavatar.capture.masks import HandMask, mask_coverage
 from handavatar.capture.tracking import TrackedHand
-from handavatar.capture.windows import resized, window_camera
+from handavatar.capture.windows import resized
 from handavatar.fit.energy import Observation
 from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.fit.pictures import FramePicture
@@ -39,9 +39,7 @@ _COMPARED_SIDE = 224
 
 def window_view(hand: TrackedHand, focal: float) -> Camera:
     """The camera of a tracked hand's window; focal length in pixels of the whole picture."""
-    window = hand.window
-    side = window.image.shape[0]
-    return window_camera(focal, window.picture_size, window.corner, side / window.scale, side)
+    return hand.window.camera(focal)
 
 
 def see_landmarks(seen: Observations, fit: HandFit) -> list[LandmarkSightings]:
@@ -51,7 +49,7 @@ def see_landmarks(seen: Observations, fit: HandFit) -> list[LandmarkSightings]:
         seen: the tracker's landmarks.
         fit: focal length, and where landmarks lie beside joints.
     """
-    center = torch.tensor(seen.picture_size) / 2
+    center = torch.tensor(seen.principal_point)
     if seen.skin is None:
         vertices = torch.zeros(0, dtype=torch.long)
         places = seen.landmarks

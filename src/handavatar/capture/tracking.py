@@ -163,6 +163,13 @@ class Track:
     notes: tuple[str, ...] = ()
     is_own: bool = False
 
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """Of the camera, pixels of the pictures; their middle where nobody said otherwise."""
+        if self.hands:
+            return self.hands[0].window.principal_point
+        return self.picture_size[0] / 2, self.picture_size[1] / 2
+
 
 class UnusableTrackError(CaptureError):
     """No hand to go on with.

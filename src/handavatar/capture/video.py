@@ -512,6 +512,7 @@ def _seen_by_finder(track: Track) -> Observations:
         scale=stacked([pixels_per_metre(hand) for hand in track.hands]),
         times=stacked([hand.time for hand in track.hands]),
         picture_size=track.picture_size,
+        principal_point=track.principal_point,
     )
 
 
@@ -666,7 +667,7 @@ def _result(
     """One frame's crop, with its mask cut where the mesh ends."""
     window = hand.window
     fit, vertices = fitted.fit, fitted.vertices[number]
-    camera = window_camera(fit.focal, window.picture_size, box.corner, box.side, size)
+    camera = window_camera(fit.focal, window.principal_point, box.corner, box.side, size)
     fine_corner, fine_side = box.seen_in(hand.stored_from)
     image = resampled(
         hand.stored_from.image, np.eye(2) * (fine_side / size), np.array(fine_corner), size
@@ -743,14 +744,14 @@ def _missing(
     focal: float,
 ) -> tuple[float, float]:
     """Shares of the mesh's pixels beyond the camera's picture, and unknown inside of it."""
-    size, center = np.array(window.picture_size), np.array(window.picture_size) / 2
+    size, center = np.array(window.picture_size), np.array(window.principal_point)
     seen = vertices.double().numpy()
     places = seen[:, :2] / np.maximum(seen[:, 2:], 0.02) * focal + center
     low, high = places.min(0), places.max(0)
     side = float((high - low).max())
     start = (low + high) / 2 - side / 2
     camera = window_camera(
-        focal, window.picture_size, (float(start[0]), float(start[1])), side, _COUNTED_SIDE
+        focal, window.principal_point, (float(start[0]), float(start[1])), side, _COUNTED_SIDE
     )
     rows, columns = np.nonzero(silhouette(rig, vertices, camera))
     if len(rows) == 0:
