@@ -40,6 +40,7 @@ def _seen_under(sky: torch.Tensor, tones: torch.Tensor) -> SeenSamples:
         alpha=torch.ones(6000),
         points=torch.zeros(6000, 3),
         rotations=torch.zeros(1, 16, 3),
+        clips=torch.zeros(1, dtype=torch.long),
     )
 
 
