@@ -417,7 +417,8 @@ def _registered(
     fit, registered = register_hands(rig, whole, observations, options, report)
     covariances = torch.linalg.inv(registered.information.double()).float()
     vertices = posed_vertices(registered)
-    wrist = registered.hand.rest_joints[0]
+    # As those have it who read the pose: without what is personal beyond the coefficients.
+    wrist = rig.shaped(fit.shape_coefficients).rest_joints[0]
     found, first = [], 0
     for clip, hands in zip(clips, before, strict=True):
         own = slice(first, first + len(clip.track.hands))
