@@ -10,6 +10,7 @@ from safetensors.torch import save_file
 
 from handavatar.capture.camera_path import mirror_cameras
 from handavatar.capture.checks import CaptureError
+from handavatar.capture.clip_gains import match_clips
 from handavatar.capture.clips import (
     Clip,
     LaidClip,
@@ -47,6 +48,7 @@ from handavatar.capture.video_report import (
     skipped,
     summary,
     too_few,
+    with_common_gain,
 )
 from handavatar.fit.energy import VIDEO_TEXTURE_SHARE, EnergyOptions
 from handavatar.fit.register import RegisterOptions
@@ -239,6 +241,10 @@ def capture_video(
     if len(frames) < MIN_KEPT:
         raise failure(options.out, *too_few(tried, len(frames)), tried)
     shape = laid[0].fitted.fit.shape_coefficients
+    if len(clips) > 1:
+        frames, alone = match_clips(frames, rig, shape)
+        tried = [_told_alone(clip) if clip.number in alone else clip for clip in tried]
+    frames = with_common_gain(frames)
     seen = count_seen_skin(rig, shape, frames)
     with CaptureWriter(
         options.out,
@@ -255,6 +261,11 @@ def capture_video(
         overview(tried, writer.file("overview.png"))
     report(1.0, "done")
     return read_capture(options.out)
+
+
+def _told_alone(clip: TriedClip) -> TriedClip:
+    note = "it shows no skin that the others show: its exposure could not be brought to theirs"
+    return replace(clip, track=replace(clip.track, notes=(*clip.track.notes, note)))
 
 
 def _check_one_side(clips: Sequence[TriedClip]) -> None:

@@ -99,7 +99,7 @@ def held_out_splits(count: int) -> list[str]:
 
 
 def kept_frames(clips: Sequence[TriedClip]) -> list[Frame]:
-    """The frames to write, with their splits, and gains relative to the average of all."""
+    """The frames to write, with their splits."""
     frames = []
     for clip in clips:
         splits, left_out = clip.splits(), clip.left_out()
@@ -108,8 +108,11 @@ def kept_frames(clips: Sequence[TriedClip]) -> list[Frame]:
             for result in clip.results
             if result.frame.name not in left_out
         ]
-    if not frames:
-        return []
+    return frames
+
+
+def with_common_gain(frames: Sequence[Frame]) -> list[Frame]:
+    """The gains relative to the average of all frames."""
     mean = torch.stack([frame.gain.double().log() for frame in frames]).mean(0)
     return [
         replace(frame, gain=((frame.gain.double().log() - mean).exp() * 1e4).round().float() / 1e4)
