@@ -62,8 +62,6 @@ class FilmOptions:
     """name of the files"""
     seed: int
     """subject, skin, light, motion, noise"""
-    take: int = 0
-    """another recording of the same subject: its own light, motion, background and noise"""
     tone: float = 0.35
     """skin: 0 very light to 1 very dark"""
     gestures: tuple[str, ...] = MOTIONS["gestures"]
@@ -100,6 +98,8 @@ class FilmOptions:
     """strength of the displacement that shape coefficients cannot express"""
     rig: str = "open-hand"
     """the hand"""
+    take: int = 0
+    """another recording of the same subject: its own light, motion, background and noise"""
 
     def __post_init__(self) -> None:
         """Refuses what cannot be made."""
