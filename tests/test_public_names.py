@@ -14,8 +14,8 @@ EXACTLY = {
         "Camera Rays framing_camera look_at pixel_centers project rays_through_pixels"
     ),
     "geometry.rotations": (
-        "apply_rigid axis_angle_from_matrix invert_rigid left_jacobian matrix_from_axis_angle matrix_from_quaternion "
-        "mean_rotation nearest_rotations quaternion_from_matrix rigid_transform "
+        "apply_rigid axis_angle_from_matrix invert_rigid left_jacobian matrix_from_axis_angle "
+        "matrix_from_quaternion mean_rotation nearest_rotations quaternion_from_matrix rigid_transform "
         "rotations_between skew"
     ),
     "hand.pose": (
