@@ -43,7 +43,7 @@ class FitOptions:
     focal_share: float = 1.0
     """Focal length over the longer side of the picture: phones and webcams have 0.75 to 1.2."""
     focal_tolerance: float = 0.1
-    """Standard deviation of the logarithm of the focal length."""
+    """Standard deviation of the logarithm of the focal length; 0: it is known."""
     landmark_error: float = LANDMARK_ERROR
     """Metres by which a tracked landmark is off, beside what the tracker itself admits."""
     outline_error: float = 0.0012
@@ -399,14 +399,15 @@ def refined(
         free = replace(
             free,
             shape_coefficients=fit.shape_coefficients.clone().requires_grad_(),
-            log_focal=fit.log_focal.clone().requires_grad_(),
             offsets=fit.offsets.clone().requires_grad_(),
         )
         groups += [
             {"params": [free.shape_coefficients], "lr": 0.03},
-            {"params": [free.log_focal], "lr": 0.002},
             {"params": [free.offsets], "lr": 0.0004},
         ]
+        if options.focal_tolerance > 0:
+            free = replace(free, log_focal=fit.log_focal.clone().requires_grad_())
+            groups.append({"params": [free.log_focal], "lr": 0.002})
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.98))
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: 0.05 + 0.95 * math.cos(0.5 * math.pi * step / steps)
@@ -521,8 +522,9 @@ def _shared_energy(
     priors = (
         fit.shape_coefficients.square().sum()
         + (fit.offsets / model.offset_tolerance[:, None]).square().sum()
-        + ((fit.log_focal - prior_focal) / options.focal_tolerance).square()
     )
+    if options.focal_tolerance > 0:
+        priors = priors + ((fit.log_focal - prior_focal) / options.focal_tolerance).square()
     energy = 0.1 * frames * priors
     if frames < 3:
         return energy

@@ -282,6 +282,20 @@ def find_guided_mask(
     return GuidedMask(HandMask(pixels, level, quality), ~unknown, edges, agreement, covered_share)
 
 
+def guided_by_given(hand: TrackedHand, mesh: PlacedMesh, mask: HandMask) -> GuidedMask:
+    """A mask that the user gives: it is believed, wherever the camera saw.
+
+    Args:
+        hand: its window.
+        mesh: as fitted.
+        mask: of the window.
+    """
+    seen = inside_picture(hand.window)
+    before = mesh.wrist.before_pixels(len(seen)) > 0
+    _, agreement = _border_quality(hand.window.image, mask.pixels, mesh, before & seen)
+    return GuidedMask(mask, seen, 1.0, agreement, 0.0)
+
+
 def _cover(
     image: UInt8[np.ndarray, "side side 3"],
     pixels: Bool[np.ndarray, "side side"],
