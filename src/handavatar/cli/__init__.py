@@ -24,6 +24,7 @@ COMMANDS: dict[str, Command] = {
     "capture degrade": capture.degrade,
     "capture check": capture.check,
     "motion from": motion.from_source,
+    "motion to": motion.to_file,
     "rig info": rig.info,
     "rig import-mano": rig.import_mano,
     "rig refine": rig.refine,

@@ -137,7 +137,7 @@ def hamer_arrays(truth: Truth) -> dict[str, np.ndarray]:
         "hand_pose": matrices[:, 1:].astype(np.float32),
         "betas": truth.betas.repeat(steps, 1).numpy().astype(np.float32),
         "right": np.full(steps, float(truth.side == "right")),
-        "cam_t_full": truth.own_places.numpy(),
+        "cam_t_full": truth.own_places.numpy().copy(),
         "img_size": np.tile([1920.0, 1080.0], (steps, 1)),
     }
 
