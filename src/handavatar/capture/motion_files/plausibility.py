@@ -30,7 +30,7 @@ WORLD_REACH = 20.0
 """Metres from the origin of a recording's world."""
 MAX_BEND = math.radians(12)
 """Mean bend of a frame's finger joints beyond their limits from which on a motion is refused: that
-of the worst tenth of the frames, since a pose of an open hand shows a fault that a relaxed hides."""
+of the worst tenth of its frames, since an open hand shows a fault that a relaxed one hides."""
 DOUBTFUL_BEND = math.radians(6)
 """The same, from which on it is told."""
 _WORST_SHARE = 0.9
