@@ -48,8 +48,8 @@ class MotionFromOptions:
     flat_hand_mean: Literal["auto", "true", "false"] = "auto"
     """As in smplx: true if a file's finger poses count from the flat hand, false if from MANO's
     mean pose. Must be said for MANO's parameters."""
-    is_pca: bool = False
-    """A file's finger poses are MANO's principal components."""
+    use_pca: bool = False
+    """As in smplx: a file's finger poses are MANO's principal components."""
     unit: Literal["m", "cm", "mm"] = "m"
     """Of a file's translations."""
     axes: Literal["opencv", "opengl"] = "opencv"
@@ -77,12 +77,13 @@ def motion_from(
     """
     if (options.source / "transforms.json").is_file():
         return motion_of_capture(read_capture(options.source), options.fps, tell)
-    if is_motion_file(options.source) or is_hawor(options.source, {}):
+    is_told = options.layout != "auto"
+    if is_told or is_motion_file(options.source) or is_hawor(options.source, {}):
         conventions = Conventions(
             options.layout,
             options.side,
             options.flat_hand_mean,
-            options.is_pca,
+            options.use_pca,
             options.unit,
             options.axes,
             options.focal,

@@ -126,7 +126,7 @@ def test_the_mean_pose_must_be_known_and_agree(refusal: Any, right: Truth, tmp_p
     path = save_pickled(tmp_path / "a.npy", arctic_fields(right))
     said = refusal(path, "--fps", "30", "--flat-hand-mean", "true")
     assert "count from MANO's mean pose, --flat-hand-mean says true" in said
-    assert "no principal components" in refusal(amass_arrays(right), "--is-pca")
+    assert "no principal components" in refusal(amass_arrays(right), "--use-pca")
     matrices = smplx_arrays(right) | {"hand_pose": hamer_arrays(right)["hand_pose"]}
     said = refusal(matrices, "--layout", "mano", *ABSOLUTE)
     assert "holds matrices, whose mean pose cannot be told" in said
@@ -145,7 +145,7 @@ def test_mean_pose_and_components_need_the_users_own_file(
     monkeypatch.setenv("HANDAVATAR_HOME", str(folder / "nowhere"))
     said = refusal(hamer_arrays(right), "--fps", "30", rig="open-hand")
     assert said.startswith("4") and "its rest pose is another than that of open-hand" in said
-    said = refusal(pca_arrays(right, True), "--is-pca", *ABSOLUTE, rig="open-hand")
+    said = refusal(pca_arrays(right, True), "--use-pca", *ABSOLUTE, rig="open-hand")
     assert said.startswith("4") and "principal components" in said
     said = refusal(relative, *told, "--mano", str(folder / "none.pkl"), rig="open-hand")
     assert said.startswith("4") and "mano.is.tue.mpg.de" in said
@@ -381,6 +381,15 @@ def test_pickles_that_would_run_something_are_refused_and_run_nothing(
     path.write_bytes(pickle.dumps([1, 2]))
     assert "it holds no dictionary" in refusal(path, "--fps", "30")
     assert not mark.exists()
+
+
+def test_files_of_torch_and_motions_themselves_are_named(refusal: Any, tmp_path: Path) -> None:
+    path = tmp_path / "world_space_res.pth"
+    path.write_bytes(b"PK")
+    assert "are programs: save their arrays with numpy.savez" in refusal(path)
+    path = tmp_path / "wave.json"
+    path.write_text('{"schema": 1, "fps": 30, "rotations": [[1]], "translations": [[1]]}')
+    assert "it is a motion file already" in refusal(path)
 
 
 def test_folders_of_several_kinds_are_refused(refusal: Any, right: Truth, tmp_path: Path) -> None:

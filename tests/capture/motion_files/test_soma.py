@@ -169,8 +169,26 @@ def test_of_a_body_and_without_a_root_the_fingers_are_read(
     assert "SOMA-X body: fingers alone" in capsys.readouterr().out
     assert_same_turns(back.rotations[:, 1:], motion.rotations[:, 1:])
     assert float(back.translations.abs().max()) == 0
+    assert float(back.rotations[:, 0].abs().max()) == 0
     back = convert(relative_to_rest(arrays, keeps_root=False), tmp_path)
     assert_same_turns(back.rotations[:, 1:], motion.rotations[:, 1:])
+    assert float(back.rotations[:, 0].abs().max()) == 0
+    assert "metacarpals" not in capsys.readouterr().out
+
+
+def test_metacarpals_that_bend_are_told(
+    motion: Motion, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The finger behind one still points where it did."""
+    arrays = soma_arrays(motion, load_open_hand(), "right")
+    local = matrix_from_axis_angle(torch.from_numpy(arrays["poses"]).double())
+    bent = matrix_from_axis_angle(torch.tensor([0.0, -0.2, 0.0]).double())
+    first, second = (JOINTS.index(name) for name in ("Pinky1", "Pinky2"))
+    local[:, second] = bent.mT @ local[:, second]
+    local[:, first] = local[:, first] @ bent
+    back = convert(arrays | {"poses": axis_angle_from_matrix(local).numpy()}, tmp_path)
+    assert "metacarpals bend by up to 11 degrees" in capsys.readouterr().out
+    assert_same_turns(back.rotations, motion.rotations)
 
 
 def refused(

@@ -32,6 +32,7 @@ from handavatar.capture.motion import Motion, read_motion
 from handavatar.cli import main
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.mano import read_mano
+from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rigs import save_rig
 
@@ -135,10 +136,10 @@ CASES: dict[str, tuple[Writer, tuple[str, ...], bool]] = {
     "whole pose": (npz(whole_pose), ABSOLUTE, True),
     "json": (as_json(lambda truth: as_lists(smplx_arrays(truth))), ABSOLUTE, True),
     "pkl": (lambda d, t: save_pickle(d / "h.pkl", smplx_arrays(t)), ABSOLUTE, True),
-    "components": (npz(lambda t: pca_arrays(t, flat=True)), ("--is-pca", *ABSOLUTE), True),
+    "components": (npz(lambda t: pca_arrays(t, flat=True)), ("--use-pca", *ABSOLUTE), True),
     "components from the mean": (
         npz(lambda t: pca_arrays(t, flat=False)),
-        ("--is-pca", *RELATIVE),
+        ("--use-pca", *RELATIVE),
         True,
     ),
     "arctic": (lambda d, t: save_pickled(d / "s.mano.npy", arctic_fields(t)), RATE, False),
@@ -298,6 +299,46 @@ def test_one_of_two_hands_is_taken_by_the_numbers_of_their_frames(tmp_path: Path
         words = ("--layout", "hamer", "--side", side, *RATE)
         motion = convert(tmp_path / "both.npz", *words, rig=f"mano-{side}")
         assert largest_error(motion, hand) < 1e-5
+
+
+def test_files_are_numbered_as_hamer_names_its_own(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Picture and hand: pictures count, whichever number a hand had in them."""
+    hands = {side: make_truth(tmp_path, side, seed=3) for side in SIDES}
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    (folder / "000007_0.jpg").write_bytes(b"an overlay beside them")
+    for step in range(6):
+        for place, side in enumerate(SIDES if step % 2 else SIDES[::-1]):
+            one = {n: v[step] for n, v in hamer_arrays(hands[side]).items()}
+            np.savez(folder / f"{step + 7:06}_{place}.npz", **one)  # type: ignore[arg-type]
+    for side, hand in hands.items():
+        words = ("--layout", "hamer", "--side", side, *RATE)
+        motion = convert(folder, *words, rig=f"mano-{side}")
+        assert len(motion) == 6 and largest_error(motion, hand) < 1e-5
+    assert "no hand in" not in capsys.readouterr().out
+
+
+def test_a_left_hand_goes_to_the_open_hand_by_the_right_ones_rest_pose(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Rest poses are alike, mean poses are not looked at: any MANO file does. At twice the rate."""
+    monkeypatch.setenv("HANDAVATAR_HOME", str(tmp_path / "right alone"))
+    save_rig(read_mano(write_twin(tmp_path)))
+    truth = make_truth(tmp_path, "left")
+    path = npz(smplx_arrays)(tmp_path, truth)
+    words = (*ABSOLUTE, "--side", "left", "--fps", "60")
+    motion = convert(path, *words, rig="open-hand-778")
+    assert "note: carried over to open-hand-778, bone by bone" in capsys.readouterr().out
+    assert (len(motion), motion.fps) == (11, 60)
+    shaped = load_open_hand("778").shaped()
+    ours = shaped.posed(HandPose(motion.rotations[::2], motion.translations[::2])).joints
+    mean = replace(truth, betas=torch.zeros(10).double(), places=truth.places)
+    wrist = truth.model.rig.shaped(truth.betas.float()).rest_joints[0]
+    theirs = mean.model.rig.shaped().posed(HandPose(truth.rotations.float(), truth.places.float()))
+    moved = theirs.joints + wrist - mean.model.rig.shaped().rest_joints[0]
+    torch.testing.assert_close(ours, moved, atol=1e-4, rtol=0)
 
 
 def test_chunks_of_hawor_come_one_after_another(truth: Truth, tmp_path: Path) -> None:

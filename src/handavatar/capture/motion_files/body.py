@@ -68,5 +68,6 @@ def read_amass(part: Part, conventions: Conventions) -> HandTrack:
         shape=torch.zeros(len(fingers), 10, dtype=torch.float64),
         fps=rate_of(part.fields, part.path),
         space="hand",
+        turns_wrist=False,
         notes=tuple(notes),
     )

@@ -177,11 +177,14 @@ def _for_rig(
             f"carried over to {rig.name}, bone by bone: bones point where they did; where "
             "fingertips come to lie differs with the proportions of the hands"
         )
+    turned = carried(rotations)
+    if not track.turns_wrist:
+        turned[:, 0] = torch.eye(3, dtype=torch.float64)
     if track.space == "hand":
         tell("the file does not place the hand: its wrist stays where it rests")
-        return carried(rotations), torch.zeros(len(rotations), 3, dtype=torch.float64)
+        return turned, torch.zeros(len(rotations), 3, dtype=torch.float64)
     target_rest = source_rest if carries_over else own_rest
-    return carried(rotations), wrists - target_rest
+    return turned, wrists - target_rest
 
 
 def _rest_wrists(rig: Rig, shape: Float[Tensor, "steps 10"]) -> Float[Tensor, "steps 3"]:

@@ -116,10 +116,10 @@ def _with_mean(conventions: Conventions, layout: Layout, source: Path) -> Conven
             f"--flat-hand-mean says {conventions.flat_hand_mean}",
             "leave --flat-hand-mean out, or say --layout mano for a file of your own",
         )
-    if conventions.is_pca and known == "true":
+    if conventions.use_pca and known == "true":
         raise CaptureError(
-            f"{source}: {layout.writer} hold no principal components, --is-pca says so",
-            "leave --is-pca out, or say --layout mano for a file of your own",
+            f"{source}: {layout.writer} hold no principal components, --use-pca says so",
+            "leave --use-pca out, or say --layout mano for a file of your own",
         )
     return replace(conventions, flat_hand_mean=known)
 
@@ -152,7 +152,11 @@ def detect_layout(parts: list[Part], conventions: Conventions, source: Path) -> 
         return "mano"
     if first_of(fields, WHOLE_NAMES) or first_of(fields, ROOT_NAMES):
         return "mano"
-    held = ", ".join(sorted(fields)[:12]) or "one array without a name"
+    if {"schema", "rotations", "translations"} <= set(fields):
+        raise CaptureError(
+            f"{source}: it is a motion file already", "give it to handavatar render RUN --motion"
+        )
+    held = ", ".join(name for name in sorted(fields)[:12] if name) or "one array without a name"
     raise CaptureError(
         f"{source}: its layout is not known; it holds {held}",
         f"say what wrote it with --layout: {', '.join(LAYOUTS)}",

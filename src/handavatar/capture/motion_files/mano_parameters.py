@@ -186,7 +186,7 @@ def _stored_hand(part: Part, side: Side | None, conventions: Conventions) -> _St
         whole = _flat_rows(fields, names, path)
         size = whole.shape[1]
         # 45 without a wrist may be the fingers alone, or 42 components behind the wrist's 3.
-        may_be_components = 3 < size < 48 and (conventions.is_pca or size < 45)
+        may_be_components = 3 < size < 48 and (conventions.use_pca or size < 45)
         if size != 48 and not may_be_components:
             raise CaptureError(
                 f"{path}: {first_of(fields, names)} has {size} values a frame, expected 48: the "
@@ -296,7 +296,7 @@ def _absolute_vectors(
 ) -> tuple[Tensor, tuple[str, ...]]:
     """Axis-angle of sixteen bones of a right hand, counted from flat, and notes."""
     size = fingers.shape[1]
-    is_pca = conventions.is_pca or size < _FINGER_VALUES
+    has_components = conventions.use_pca or size < _FINGER_VALUES
     if size > _FINGER_VALUES:
         raise CaptureError(
             f"{source}: {size} values for the fingers, expected 45 or fewer components",
@@ -311,7 +311,7 @@ def _absolute_vectors(
     notes: list[str] = []
     # A left hand in the mirror: the MANO file of its side is read as its mirror image too.
     sign = torch.tensor([1.0, -1.0, -1.0] if side == "left" else [1.0, 1.0, 1.0]).to(root)
-    if is_pca:
+    if has_components:
         model = find_model(side, "the finger poses are principal components, which it holds")
         components = model.hands_components.to(root).flatten(1)
         fingers = fingers @ components[:size]

@@ -1,6 +1,7 @@
 """What all layouts have in common: rotations from arrays, sides told apart, frames counted."""
 
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,7 @@ FRAME_NAMES = ("frame", "frames", "frame_idx", "frame_id")
 _FINGERS = NUM_BONES - 1
 _NUM_SHAPES = 10
 _MAX_FPS = 1000.0
+_NUMBER = re.compile(r"[0-9]{1,15}")
 
 
 def bone_matrices(
@@ -213,15 +215,15 @@ def rate_of(fields: Fields, path: Path) -> float | None:
 def frame_numbers(parts: list[Part], counts: list[int]) -> list[Tensor]:
     """Number of the frame of every row, part by part.
 
-    Rows of a single file are frames unless the file numbers them; a folder's files are frames,
-    numbered by their names if these end with numbers that differ, else in their order.
+    Rows of a single file are frames unless the file numbers them. A folder's files are frames,
+    numbered by the last number in their names, or by the one before it where that differs too
+    (``000012_1``: the second hand of picture 12); else they are frames in their order.
 
     Args:
         parts: files.
         counts: rows in each.
     """
-    numbers = [part.number for part in parts]
-    is_numbered = min(numbers) >= 0 and numbers == sorted(set(numbers))
+    numbers = _numbers_of_names(parts)
     found = []
     for place, (part, count) in enumerate(zip(parts, counts, strict=True)):
         name = first_of(part.fields, FRAME_NAMES)
@@ -231,8 +233,19 @@ def frame_numbers(parts: list[Part], counts: list[int]) -> list[Tensor]:
         elif len(parts) == 1:
             found.append(torch.arange(count))
         else:
-            found.append(torch.full((count,), numbers[place] if is_numbered else place))
+            found.append(torch.full((count,), numbers[place]))
     return found
+
+
+def _numbers_of_names(parts: list[Part]) -> list[int]:
+    names = [[int(found) for found in _NUMBER.findall(part.path.stem)] for part in parts]
+    if min(len(numbers) for numbers in names) >= 2:
+        pictures = [numbers[-2] for numbers in names]
+        if pictures == sorted(pictures) and len(set(pictures)) > 1:
+            return pictures
+    lasts = [numbers[-1] for numbers in names if numbers]
+    is_growing = len(lasts) == len(parts) and lasts == sorted(set(lasts))
+    return lasts if is_growing else list(range(len(parts)))
 
 
 def refuse_mixed_rows(part: Part, sides: Tensor, is_alone: bool) -> None:
@@ -287,6 +300,7 @@ def track_of_rows(
     fps: float | None,
     describes_right: bool = False,
     skeleton: Skeleton = "mano",
+    turns_wrist: bool = True,
     notes: tuple[str, ...] = (),
 ) -> HandTrack:
     """One hand's rows in the order of the frames, a left one mirrored into a right one.
@@ -300,6 +314,7 @@ def track_of_rows(
         describes_right: rotations of left hands are those of a right hand in a mirrored picture
             already, while the translation is the left hand's.
         skeleton: whose rest pose the rotations count from.
+        turns_wrist: whether the file turns the wrist.
         notes: what a person should know.
 
     Raises:
@@ -342,6 +357,7 @@ def track_of_rows(
         fps=fps,
         space=space if is_placed else "hand",
         skeleton=skeleton,
+        turns_wrist=turns_wrist,
         notes=notes,
     )
 

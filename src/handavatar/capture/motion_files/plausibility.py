@@ -164,7 +164,7 @@ def check_bends(
         "mean pose or the order of the bones is another",
         "within the limits it is, if " + "; or if ".join(fitting)
         if fitting
-        else "check --side, --flat-hand-mean, --is-pca and --layout against what wrote the file",
+        else "check --side, --flat-hand-mean, --use-pca and --layout against what wrote the file",
     )
 
 

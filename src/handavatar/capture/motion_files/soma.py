@@ -15,6 +15,7 @@ Source: py-soma-x 0.3.4, save_soma_npz and SOMAHandLayer (their documentation).
 """
 
 import io
+import math
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,7 @@ JOINTS: tuple[str, ...] = (
 """SOMA's 25 joints in its order, after ``RightHand`` or ``LeftHand``."""
 _UNIT_NAMES = {"meters": 1.0, "centimeters": 0.01, "millimeters": 0.001}
 _NUM_IDENTITY = 20
+_TOLD_BEND = 2.0
 # Which of SOMA's joints carries each bone.
 _JOINT_OF_BONE = tuple(
     ""
@@ -172,7 +174,12 @@ def read_soma(part: Part, conventions: Conventions) -> HandTrack:
                 f"transl {len(places)}",
                 "give one row for each frame",
             )
-    notes.append("SOMA-X: metacarpals turn with the wrist here; they bend the fingers' roots alone")
+    bend = _metacarpal_bend(local)
+    if bend > _TOLD_BEND:
+        notes.append(
+            f"SOMA-X: its metacarpals bend by up to {bend:.0f} degrees; fingers point where they "
+            "did, the palm here stays rigid"
+        )
     rows = Rows(
         frames=frame_numbers([part], [len(rotations)])[0],
         is_right=torch.full((len(rotations),), int(side == "right")),
@@ -188,8 +195,19 @@ def read_soma(part: Part, conventions: Conventions) -> HandTrack:
         fps=rate_of(fields, path),
         describes_right=True,
         skeleton="soma",
+        turns_wrist=not is_body and f"{side.title()}Hand" in names,
         notes=tuple(notes),
     )
+
+
+def _metacarpal_bend(local: dict[str, Tensor]) -> float:
+    """The largest angle, in degrees, of a metacarpal from its place at rest."""
+    turns = [
+        local[name] @ torch.tensor(axes, dtype=torch.float64).T
+        for name, axes in _METACARPALS.items()
+    ]
+    angles = axis_angle_from_matrix(torch.stack(turns)).norm(dim=-1)
+    return math.degrees(float(angles.max()))
 
 
 def _right_axes(dtype: torch.dtype) -> Float[Tensor, "3 3"]:

@@ -18,6 +18,7 @@ from handavatar.hand.inert_pickle import InertObject, PickleError, read_pickle
 from handavatar.hand.pickled_arrays import ARRAY_NAMES, dense_array, single_object
 
 SUFFIXES = (".npz", ".npy", ".json", ".pkl")
+_PROGRAMS = (".pt", ".pth", ".pickle", ".joblib")
 MAX_BYTES = 512 * 2**20
 _MAX_FILES = 200_000
 _MAX_DEPTH = 6
@@ -41,9 +42,9 @@ class Part:
 
 
 def is_motion_file(path: Path) -> bool:
-    """Whether a path is a file, or a folder of files, that this package may read."""
+    """Whether a path is a file, or a folder of such files alone, that this package reads or names."""
     if path.is_file():
-        return path.suffix.lower() in SUFFIXES
+        return path.suffix.lower() in (*SUFFIXES, *_PROGRAMS)
     if not path.is_dir():
         return False
     names = [child for child in path.iterdir() if child.is_file()]
@@ -83,6 +84,11 @@ def read_part(path: Path) -> Part:
     suffix = path.suffix.lower()
     if path.is_symlink() or not path.is_file():
         raise CaptureError(f"{path}: no such file", "name a file; links are not followed")
+    if suffix not in SUFFIXES:
+        raise CaptureError(
+            f"{path}: files of the kinds {', '.join(SUFFIXES)} are read",
+            "torch's and joblib's files are programs: save their arrays with numpy.savez",
+        )
     if path.stat().st_size > MAX_BYTES:
         raise CaptureError(
             f"{path}: larger than {MAX_BYTES // 2**20} MB", "save the hand's parameters alone"

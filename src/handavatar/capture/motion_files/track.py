@@ -29,7 +29,7 @@ class Conventions:
         side: the hand that is meant; ``auto``: the only one in the file.
         flat_hand_mean: as in smplx: ``true`` if poses count from the flat hand, ``false`` if from
             MANO's mean pose; ``auto``: as the layout has it.
-        is_pca: the hand pose is given in MANO's principal components.
+        use_pca: as in smplx: the hand pose is given in MANO's principal components.
         unit: of lengths.
         axes: of the camera: ``opengl`` has y up and z backwards.
         focal: true focal length of the pictures in pixels.
@@ -38,7 +38,7 @@ class Conventions:
     layout: LayoutName = "auto"
     side: Literal["auto", "left", "right"] = "auto"
     flat_hand_mean: Literal["auto", "true", "false"] = "auto"
-    is_pca: bool = False
+    use_pca: bool = False
     unit: Literal["m", "cm", "mm"] = "m"
     axes: Literal["opencv", "opengl"] = "opencv"
     focal: float | None = None
@@ -57,6 +57,7 @@ class HandTrack:
         fps: frames a second, None if the file does not say it.
         space: what the translations are relative to; ``hand``: the file places no hand.
         skeleton: whose rest pose the rotations count from.
+        turns_wrist: whether the file turns the wrist; else it stays as it rests.
         notes: what a person should know.
     """
 
@@ -68,6 +69,7 @@ class HandTrack:
     fps: float | None
     space: Space
     skeleton: Skeleton = "mano"
+    turns_wrist: bool = True
     notes: tuple[str, ...] = ()
 
 
