@@ -120,10 +120,13 @@ def motion_of_file(
         raise CaptureError(
             f"{source}: it does not say how many frames a second it has", "say it with --fps"
         )
-    motion_rotations, translations = _for_rig(placed, rig, conventions, finder, layout.name, tell)
-    _tell_missing(track, tell)
     times = track.frames.double() / rate
-    return evenly_spaced(times, motion_rotations, translations, fps or rate, tell)
+    try:
+        rotations, places = _for_rig(placed, rig, conventions, finder, layout.name, tell)
+        _tell_missing(track, tell)
+        return evenly_spaced(times, rotations, places, fps or rate, tell)
+    except CaptureError as error:
+        raise CaptureError(f"{source}: {error.what}", error.remedy) from error
 
 
 def _placed(track: HandTrack, conventions: Conventions) -> HandTrack:

@@ -42,7 +42,7 @@ class Part:
 
 
 def is_motion_file(path: Path) -> bool:
-    """Whether a path is a file, or a folder of such files alone, that this package reads or names."""
+    """Whether a path is a file that is read here, or refused by name, or a folder of such files."""
     if path.is_file():
         return path.suffix.lower() in (*SUFFIXES, *_PROGRAMS)
     if not path.is_dir():
