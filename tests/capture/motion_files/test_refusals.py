@@ -26,6 +26,7 @@ from layout_files import (
     write_twin,
 )
 
+from handavatar.capture.motion_files import stored
 from handavatar.cli import main
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.mano import read_mano
@@ -381,6 +382,30 @@ def test_pickles_that_would_run_something_are_refused_and_run_nothing(
     path.write_bytes(pickle.dumps([1, 2]))
     assert "it holds no dictionary" in refusal(path, "--fps", "30")
     assert not mark.exists()
+
+
+def test_arrays_of_several_objects_are_refused(refusal: Any, tmp_path: Path) -> None:
+    objects = np.empty(2, dtype=object)
+    objects[:] = [{"rot": np.zeros(3)}, {}]
+    np.save(tmp_path / "two.npy", objects, allow_pickle=True)
+    assert "expected one object in an array" in refusal(tmp_path / "two.npy", "--fps", "30")
+    path = save_pickled(tmp_path / "text.npy", {"right": {"rot": [["a"], ["b", "c"]]}})
+    assert "rot is a list whose rows differ in length" in refusal(path, "--fps", "30")
+    np.save(tmp_path / "plain.npy", np.zeros((4, 48)))
+    said = refusal(tmp_path / "plain.npy", "--fps", "30")
+    assert "it holds one array without a name" in said
+
+
+def test_files_too_large_are_refused(
+    refusal: Any, right: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By what they unpack to, before anything is unpacked."""
+    monkeypatch.setattr(stored, "MAX_BYTES", 2 * 2**20)
+    np.savez_compressed(tmp_path / "bomb.npz", hand_pose=np.zeros(2**20))
+    assert (tmp_path / "bomb.npz").stat().st_size < 10_000
+    assert "unpacks to more than 2 MB" in refusal(tmp_path / "bomb.npz", *ABSOLUTE)
+    (tmp_path / "large.json").write_bytes(b" " * (2 * 2**20 + 1))
+    assert "larger than 2 MB" in refusal(tmp_path / "large.json", *ABSOLUTE)
 
 
 def test_files_of_torch_and_motions_themselves_are_named(refusal: Any, tmp_path: Path) -> None:

@@ -341,6 +341,27 @@ def test_a_left_hand_goes_to_the_open_hand_by_the_right_ones_rest_pose(
     torch.testing.assert_close(ours, moved, atol=1e-4, rtol=0)
 
 
+def test_one_frame_is_a_motion_of_one_step(truth: Truth, tmp_path: Path) -> None:
+    single = replace(truth, rotations=truth.rotations[:1], places=truth.places[:1])
+    arrays = {name: values[0] for name, values in hamer_arrays(single).items()}
+    np.savez(tmp_path / "one.npz", **arrays)  # type: ignore[arg-type]
+    motion = convert(tmp_path / "one.npz", "--layout", "hamer", *RATE, rig=f"mano-{truth.side}")
+    assert len(motion) == 1 and largest_error(motion, single) < 1e-5
+
+
+def test_a_hand_that_is_not_placed_turns_where_it_rests(
+    truth: Truth, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arrays = hamer_arrays(truth)
+    del arrays["cam_t_full"]
+    np.savez(tmp_path / "hand.npz", **arrays)  # type: ignore[arg-type]
+    words = ("--layout", "hamer", *RATE)
+    motion = convert(tmp_path / "hand.npz", *words, rig=f"mano-{truth.side}")
+    assert "note: the file does not place the hand" in capsys.readouterr().out
+    unplaced = replace(truth, places=torch.zeros_like(truth.places))
+    assert largest_error(motion, unplaced) < 1e-5
+
+
 def test_chunks_of_hawor_come_one_after_another(truth: Truth, tmp_path: Path) -> None:
     halves = [
         replace(truth, rotations=truth.rotations[part], places=truth.places[part])
