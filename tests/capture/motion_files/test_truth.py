@@ -18,6 +18,7 @@ from layout_files import (
     interhand_frames,
     left_rig,
     make_truth,
+    mean_pose,
     pca_arrays,
     save_pickle,
     save_pickled,
@@ -339,6 +340,47 @@ def test_a_left_hand_goes_to_the_open_hand_by_the_right_ones_rest_pose(
     theirs = mean.model.rig.shaped().posed(HandPose(truth.rotations.float(), truth.places.float()))
     moved = theirs.joints + wrist - mean.model.rig.shaped().rest_joints[0]
     torch.testing.assert_close(ours, moved, atol=1e-4, rtol=0)
+
+
+def test_few_components_are_the_first_ones(
+    truth: Truth, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Fifteen, as HOT3D has them; that they are components is told, not asked for."""
+    coefficients = 0.2 * torch.randn(6, 15, generator=torch.Generator().manual_seed(2)).double()
+    components = torch.from_numpy(hand_fields()["hands_components"])[:15]
+    fingers = coefficients @ components + torch.from_numpy(mean_pose())
+    rotations = torch.cat([truth.rotations[:, :1], fingers.unflatten(1, (15, 3))], dim=1)
+    expected = replace(truth, rotations=rotations)
+    arrays = smplx_arrays(expected) | {"hand_pose": coefficients.numpy()}
+    np.savez(tmp_path / "few.npz", **arrays)  # type: ignore[arg-type]
+    words = (*RELATIVE, "--side", truth.side)
+    motion = convert(tmp_path / "few.npz", *words, rig=f"mano-{truth.side}")
+    assert "note: 15 principal components of MANO's finger poses" in capsys.readouterr().out
+    assert largest_error(motion, expected) < 1e-5
+
+
+def test_the_wrist_of_the_files_own_shape_is_placed(tmp_path: Path) -> None:
+    """Of a hand whose wrist moves with its shape, as the real MANO's does."""
+    directions = hand_fields()["shapedirs"] + 0.004 * np.array([[1.0], [-1.0], [2.0]])
+    file = write_twin(tmp_path, shapedirs=directions)
+    truth = make_truth(tmp_path)
+    rig = read_mano(write_twin(tmp_path, shapedirs=directions)).rig
+    wrist = rig.shaped(truth.betas.float()).rest_joints[0]
+    assert float((wrist - rig.shaped().rest_joints[0]).norm()) > 5e-3
+    words = (*ABSOLUTE, "--side", "right", "--mano", str(file))
+    motion = convert(npz(smplx_arrays)(tmp_path, truth), *words, rig="open-hand-778")
+    expected = truth.places.float() + wrist
+    torch.testing.assert_close(motion.translations, expected, atol=2e-5, rtol=0)
+
+
+def test_files_that_are_numbered_in_tens_are_successive_frames(
+    truth: Truth, tmp_path: Path
+) -> None:
+    folder = as_files(hamer_arrays)(tmp_path, truth)
+    for path in sorted(folder.iterdir(), reverse=True):
+        path.rename(folder / f"picture{path.stem.split('_')[1]}0.npz")
+    motion = convert(folder, "--layout", "hamer", *RATE, rig=f"mano-{truth.side}")
+    assert len(motion) == 6 and largest_error(motion, truth) < 1e-5
 
 
 def test_one_frame_is_a_motion_of_one_step(truth: Truth, tmp_path: Path) -> None:
