@@ -15,6 +15,7 @@ from handavatar.hand.pose_sampling import gesture_rotations
 
 SIDE = 320
 PICTURE = (400, 400)
+CENTER = (200.0, 200.0)
 CORNER = (40.0, 40.0)
 FOCAL = 400.0
 SKIN = np.array([205.0, 150.0, 120.0])
@@ -41,7 +42,7 @@ def made_hand(number: int) -> tuple[TrackedHand, np.ndarray]:
     rig, fit = load_open_hand("778"), made_fit(number)
     generator = np.random.default_rng(number)
     model = HandModel(rig)
-    camera = window_camera(FOCAL, PICTURE, CORNER, float(SIDE), SIDE)
+    camera = window_camera(FOCAL, CENTER, CORNER, float(SIDE), SIDE)
     mask = silhouette(rig, model.all_vertices(fit)[0], camera)
     y, x = np.mgrid[:SIDE, :SIDE]
     wall = np.stack([110 + 25 * (x // 40 % 2), 120 + 0 * x, 130 + 20 * (y // 60 % 2)], axis=-1)
@@ -53,7 +54,7 @@ def made_hand(number: int) -> tuple[TrackedHand, np.ndarray]:
         index=number,
         time=number / 10,
         window=Window(image.clip(0, 255).astype(np.uint8), CORNER, 1.0, PICTURE),
-        landmarks=projected(points, fit.log_focal.exp(), PICTURE)[0].double().numpy(),
+        landmarks=projected(points, fit.log_focal.exp(), CENTER)[0].double().numpy(),
         spread=np.ones(21),
         world_landmarks=(points - points.mean(1, keepdim=True))[0].double().numpy(),
         presence=0.95,

@@ -36,6 +36,7 @@ from handavatar.hand.pose_sampling import gesture_rotations, interpolate_rotatio
 from handavatar.hand.rig import Rig
 
 PICTURE = (1280, 720)
+CENTER = (640.0, 360.0)
 FOCAL = 1280.0
 FRAMES = 6
 
@@ -71,12 +72,13 @@ def _seen(rig: Rig, truth: HandFit) -> Observations:
     model = HandModel(rig)
     points = model.landmarks(truth)
     return Observations(
-        landmarks=projected(points, truth.log_focal.exp(), PICTURE),
+        landmarks=projected(points, truth.log_focal.exp(), CENTER),
         uncertainty=torch.full((len(points), 21), 0.5),
         world_landmarks=points - points.mean(1, keepdim=True),
         scale=FOCAL / points[..., 2].mean(1),
         times=torch.arange(len(points)) / 10,
         picture_size=PICTURE,
+        principal_point=CENTER,
     )
 
 
@@ -201,11 +203,11 @@ def test_outlines_draw_the_mesh_onto_the_mask(rig: Rig, truth: HandFit) -> None:
         low = seen.landmarks[frame].amin(0) - 60
         side = float((seen.landmarks[frame].amax(0) + 60 - low).max())
         corner = (float(low[0]), float(low[1]))
-        camera = window_camera(FOCAL, PICTURE, corner, side, 256)
+        camera = window_camera(FOCAL, CENTER, corner, side, 256)
         mask = silhouette(rig, vertices[frame], camera)
         window = Window(np.zeros((256, 256, 3), dtype=np.uint8), corner, 256 / side, PICTURE)
         outlines.append(mask_outline(mask, window, float(seen.scale[frame])))
-    matcher = OutlineMatcher(rig, outlines, PICTURE)
+    matcher = OutlineMatcher(rig, outlines, CENTER)
 
     # Landmarks of a tracker that errs by 8 pixels, towards the same side in all frames.
     noise = 8 * torch.randn(1, 21, 2, generator=torch.manual_seed(1))
@@ -220,7 +222,7 @@ def test_outlines_draw_the_mesh_onto_the_mask(rig: Rig, truth: HandFit) -> None:
         shares = []
         for outline, hand in zip(outlines, model.all_vertices(tried), strict=True):
             window = outline.window
-            camera = window_camera(tried.focal, PICTURE, window.corner, 256 / window.scale, 256)
+            camera = window_camera(tried.focal, CENTER, window.corner, 256 / window.scale, 256)
             mesh = silhouette(rig, hand, camera)
             shares.append((mesh & outline.mask).sum() / (mesh | outline.mask).sum())
         return float(np.mean(shares))

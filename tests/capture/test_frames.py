@@ -439,6 +439,22 @@ def test_gains_that_make_no_sense_are_refused(tmp_path: Path, gain: list[float])
         read_capture(tmp_path / "c")
 
 
+def test_frames_know_their_clip(tmp_path: Path) -> None:
+    frames = [replace(make_frame(index), clip=index // 2) for index in range(3)]
+    capture = write_capture(tmp_path / "c", frames, **HEADER)
+    assert [capture.frame(index).clip for index in range(3)] == [0, 0, 1]
+    assert capture.num_clips == 2
+    file = tmp_path / "c" / "transforms.json"
+    content = json.loads(file.read_text())
+    # Captures of one clip say nothing of it, as those of before did.
+    assert "clip" not in content["frames"][0]
+    for wrong in (-1, 0.5, 1000, "palm"):
+        content["frames"][2]["clip"] = wrong
+        file.write_text(json.dumps(content))
+        with pytest.raises(CaptureError, match="clip"):
+            read_capture(tmp_path / "c")
+
+
 def test_binning_averages_whole_blocks_and_keeps_the_view() -> None:
     frame = lit_frame(1, "train", size=96)
     known = torch.ones(96, 96, dtype=torch.bool)

@@ -61,6 +61,7 @@ def _seen(places: torch.Tensor, unsure: float) -> Observations:
         scale=torch.full((frames,), 1000.0),
         times=torch.arange(frames) / 10,
         picture_size=(640, 480),
+        principal_point=(320.0, 240.0),
     )
 
 

@@ -14,22 +14,17 @@ from safetensors.torch import load_file
 from scipy import ndimage
 from videos import REAL_VIDEO, grey_levels, needs_real_video, save_video
 
+from handavatar.capture import clips as clips_module
 from handavatar.capture import video as video_module
 from handavatar.capture.checks import CaptureError
+from handavatar.capture.clips import FittedHands
+from handavatar.capture.fitted_frames import Box, stored_size
 from handavatar.capture.fitted_hand import HandModel
 from handavatar.capture.fitting import FitOptions
 from handavatar.capture.frames import find_problems
 from handavatar.capture.tracking import Glance, Track
-from handavatar.capture.video import (
-    FittedHands,
-    VideoOptions,
-    capture_video,
-    held_out_splits,
-    splits_by_index,
-    stored_size,
-    summary_lines,
-    track_video,
-)
+from handavatar.capture.video import VideoOptions, capture_video, track_video
+from handavatar.capture.video_report import TriedClip, held_out_splits, summary_lines
 from handavatar.capture.windows import (
     FINE_SIDE,
     MASK_SIDE,
@@ -67,8 +62,10 @@ def _track(num_hands: int, num_skipped: int, reason: str = "no hand found") -> T
 
 
 def test_what_is_held_out_does_not_depend_on_what_was_found() -> None:
-    found, hardly = (splits_by_index(_track(*counts)) for counts in ((40, 0), (22, 18)))
-    assert found == hardly and list(found) == list(range(40))
+    found, hardly = (
+        TriedClip("made.mp4", _track(*counts)).splits() for counts in ((40, 0), (22, 18))
+    )
+    assert found == hardly and list(found) == [f"{number:06d}" for number in range(40)]
     assert list(found.values()) == held_out_splits(40)
 
 
@@ -152,8 +149,8 @@ def test_a_hand_that_leaves_the_picture_is_rejected_by_that_name(
     pytest.importorskip("cv2")
     options, rig = _made_video(tmp_path, monkeypatch, 205)
     seen = []
-    result_of = video_module._result
-    monkeypatch.setattr(video_module, "_result", lambda *a: seen.append(result_of(*a)) or seen[-1])
+    crop = video_module.crop_frame
+    monkeypatch.setattr(video_module, "crop_frame", lambda *a: seen.append(crop(*a)) or seen[-1])
     with pytest.raises(CaptureError, match="the hand leaves the picture") as caught:
         capture_video(options, rig)
     assert "step back" in caught.value.remedy
@@ -208,7 +205,7 @@ def test_picture_and_mask_are_cut_from_the_same_square(is_mirrored: bool) -> Non
     hand = replace(made_hand(0)[0], window=windows[0], fine=windows[1], landmarks=landmarks)
     hand = hand.mirrored() if is_mirrored else hand
     assert hand.window.scale < 0.7 < 1 == pytest.approx(hand.stored_from.scale, abs=0.01)
-    box = video_module._Box((420.5, 260.25), 500.0)
+    box = Box((420.5, 260.25), 500.0)
     direct = image[:, ::-1] if is_mirrored else image
     cuts = []
     for window in (hand.window, hand.stored_from):
@@ -259,9 +256,9 @@ def _made_video(
     fitted = FittedHands(several, torch.stack(vertices), errors, covariances, [sighting] * _MADE)
     monkeypatch.setattr(video_module, "track_hand", lambda *_: track)
     monkeypatch.setattr(video_module, "frames_of", lambda *_: iter(()))
-    monkeypatch.setattr(video_module, "_found_masks", lambda *_: [])
-    monkeypatch.setattr(video_module, "_fitted_to_landmarks", lambda *_: fitted)
-    monkeypatch.setattr(video_module, "_registered", lambda *_: fitted)
+    monkeypatch.setattr(clips_module, "_found_masks", lambda *_: [])
+    monkeypatch.setattr(clips_module, "_fitted_to_landmarks", lambda *_: [fitted])
+    monkeypatch.setattr(clips_module, "_registered", lambda *_: [fitted])
     return VideoOptions(tmp_path / "made.mp4", tmp_path / "out"), rig
 
 

@@ -45,6 +45,7 @@ from handavatar.bench.measures import (
     mesh_pixels,
 )
 from handavatar.capture.checks import CaptureError
+from handavatar.capture.clips import observations_of
 from handavatar.capture.default import default_capture
 from handavatar.capture.degraded import DegradeOptions, degrade_capture
 from handavatar.capture.fitted_hand import HandFit
@@ -58,7 +59,6 @@ from handavatar.capture.video import (
     TrackerChoice,
     VideoOptions,
     capture_video,
-    observations_of,
     track_video,
 )
 from handavatar.evaluate.intervals import mean_interval
@@ -406,7 +406,7 @@ class FilmRoad:
             mask_outline(find_mask(hand, colors).pixels, hand.window, float(scale))
             for hand, scale in zip(hands, seen.scale, strict=True)
         ]
-        return OutlineMatcher(self.truth.rig, outlines, self.track().picture_size)
+        return OutlineMatcher(self.truth.rig, outlines, seen.principal_point)
 
     def _tried(self) -> int:
         """Pictures that were looked at."""

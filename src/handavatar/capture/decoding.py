@@ -56,11 +56,13 @@ class VideoFrame:
         index: number of the frame in the file, from 0.
         time: seconds from the first frame.
         image: sRGB.
+        name: of its file, where it has one.
     """
 
     index: int
     time: float
     image: UInt8[np.ndarray, "height width 3"]
+    name: str = ""
 
 
 @dataclass(frozen=True)

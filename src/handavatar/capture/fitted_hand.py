@@ -134,8 +134,8 @@ class HandModel:
 
 
 def projected(
-    points: Float[Tensor, "*n 3"], focal: Float[Tensor, ""], picture_size: tuple[int, int]
+    points: Float[Tensor, "*n 3"], focal: Float[Tensor, ""], principal_point: tuple[float, float]
 ) -> Float[Tensor, "*n 2"]:
-    """Pixels of points in camera axes; the principal point is the picture's centre."""
-    center = points.new_tensor(picture_size) / 2
+    """Pixels of points in camera axes."""
+    center = points.new_tensor(principal_point)
     return points[..., :2] / points[..., 2:].clamp_min(0.02) * focal + center

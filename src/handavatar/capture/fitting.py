@@ -43,7 +43,7 @@ class FitOptions:
     focal_share: float = 1.0
     """Focal length over the longer side of the picture: phones and webcams have 0.75 to 1.2."""
     focal_tolerance: float = 0.1
-    """Standard deviation of the logarithm of the focal length."""
+    """Standard deviation of the logarithm of the focal length; 0: it is known."""
     landmark_error: float = LANDMARK_ERROR
     """Metres by which a tracked landmark is off, beside what the tracker itself admits."""
     outline_error: float = 0.0012
@@ -99,6 +99,7 @@ class Observations:
         scale: picture pixels per metre at the hand.
         times: seconds.
         picture_size: width and height, pixels.
+        principal_point: of the camera, pixels.
         skin: what our own tracker sees beside them; None where it was not asked.
     """
 
@@ -108,6 +109,7 @@ class Observations:
     scale: Float[Tensor, "frames"]
     times: Float[Tensor, "frames"]
     picture_size: tuple[int, int]
+    principal_point: tuple[float, float]
     skin: SkinObservations | None = None
 
     def chosen(self, frames: Int[Tensor, "chosen"]) -> "Observations":
@@ -119,6 +121,7 @@ class Observations:
             self.scale[frames],
             self.times[frames],
             self.picture_size,
+            self.principal_point,
             None if self.skin is None else self.skin.chosen(frames),
         )
 
@@ -347,7 +350,7 @@ def initial_fit(model: HandModel, observations: Observations, options: FitOption
 
 def placed(model: HandModel, observations: Observations, fit: HandFit) -> HandFit:
     """The same poses, moved (not turned) to where the 2D landmarks are; least squares."""
-    center = torch.tensor(observations.picture_size) / 2
+    center = torch.tensor(observations.principal_point)
     points = model.landmarks(replace(fit, translation=torch.zeros_like(fit.translation)))
     rays = (observations.landmarks - center) / fit.log_focal.exp()
     one, zero = torch.ones_like(rays[..., 0]), torch.zeros_like(rays[..., 0])
@@ -396,14 +399,15 @@ def refined(
         free = replace(
             free,
             shape_coefficients=fit.shape_coefficients.clone().requires_grad_(),
-            log_focal=fit.log_focal.clone().requires_grad_(),
             offsets=fit.offsets.clone().requires_grad_(),
         )
         groups += [
             {"params": [free.shape_coefficients], "lr": 0.03},
-            {"params": [free.log_focal], "lr": 0.002},
             {"params": [free.offsets], "lr": 0.0004},
         ]
+        if options.focal_tolerance > 0:
+            free = replace(free, log_focal=fit.log_focal.clone().requires_grad_())
+            groups.append({"params": [free.log_focal], "lr": 0.002})
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.98))
     schedule = torch.optim.lr_scheduler.LambdaLR(
         optimizer, lambda step: 0.05 + 0.95 * math.cos(0.5 * math.pi * step / steps)
@@ -446,7 +450,7 @@ def landmark_errors(
     model: HandModel, observations: Observations, fit: HandFit
 ) -> Float[Tensor, "frames"]:
     """Mean distance of fitted and tracked landmarks in every frame, pixels."""
-    seen = projected(model.landmarks(fit), fit.log_focal.exp(), observations.picture_size)
+    seen = projected(model.landmarks(fit), fit.log_focal.exp(), observations.principal_point)
     return (seen - observations.landmarks).norm(dim=-1).mean(-1)
 
 
@@ -460,7 +464,7 @@ def _frame_energy(
     """What each frame's own observations and the limits of its joints say."""
     focal = fit.log_focal.exp()
     landmarks = model.landmarks(fit)
-    apart = projected(landmarks, focal, observations.picture_size) - observations.landmarks
+    apart = projected(landmarks, focal, observations.principal_point) - observations.landmarks
     expected = torch.hypot(
         observations.uncertainty, options.landmark_error * observations.scale[:, None]
     )
@@ -484,7 +488,7 @@ def _outline_energy(
     pairs: OutlinePairs,
 ) -> Float[Tensor, "frames"]:
     points = model.vertices(fit, pairs.vertices)
-    seen = projected(points, fit.log_focal.exp(), observations.picture_size)
+    seen = projected(points, fit.log_focal.exp(), observations.principal_point)
     apart = seen - pairs.targets
     across = (apart * pairs.normals).sum(-1)
     along = apart[..., 0] * pairs.normals[..., 1] - apart[..., 1] * pairs.normals[..., 0]
@@ -518,8 +522,9 @@ def _shared_energy(
     priors = (
         fit.shape_coefficients.square().sum()
         + (fit.offsets / model.offset_tolerance[:, None]).square().sum()
-        + ((fit.log_focal - prior_focal) / options.focal_tolerance).square()
     )
+    if options.focal_tolerance > 0:
+        priors = priors + ((fit.log_focal - prior_focal) / options.focal_tolerance).square()
     energy = 0.1 * frames * priors
     if frames < 3:
         return energy

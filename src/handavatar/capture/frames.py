@@ -62,6 +62,8 @@ Said = TypeVar("Said")
 SCHEMA = 1
 SPLITS = ("train", "val", "test")
 MAX_FRAMES = 100_000
+MAX_CLIPS = 32
+"""Recordings of one hand in a capture."""
 FITTED_SIDE = 256
 """Pixels along a side of the pictures that hands are laid onto, learned from and judged; larger
 ones are binned towards it (:meth:`Frame.binned`)."""
@@ -134,6 +136,7 @@ class Frame:
             (metres), as far as neither landmarks nor mask nor colours tell it; None where the
             capture does not say.
         landmarks: that a tracker saw; None where the capture does not say.
+        clip: number of the recording that it belongs to, from 0: each has a light of its own.
     """
 
     name: str
@@ -148,6 +151,7 @@ class Frame:
     gain: Float[Tensor, "3"] = None  # type: ignore[assignment]
     covariance: Float[Tensor, "51 51"] | None = None
     landmarks: LandmarkSightings | None = None
+    clip: int = 0
 
     def __post_init__(self) -> None:
         """Fills in what most pictures need not say."""
@@ -236,6 +240,7 @@ class FrameRecord:
     time: float
     known_path: str = ""
     gain: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    clip: int = 0
 
 
 @dataclass(frozen=True)
@@ -314,6 +319,7 @@ class Capture:
             gain=torch.tensor(record.gain),
             covariance=None if self.covariances is None else self.covariances[index],
             landmarks=None if self.landmarks is None else self.landmarks[index],
+            clip=record.clip,
         )
 
     @cached_property
@@ -394,6 +400,11 @@ class Capture:
         if name not in SPLITS:
             raise CaptureError(f"there is no split {name!r}", f"ask for one of {', '.join(SPLITS)}")
         return tuple(i for i, record in enumerate(self.records) if record.split == name)
+
+    @property
+    def num_clips(self) -> int:
+        """How many recordings the frames come from: each has a light of its own."""
+        return 1 + max(record.clip for record in self.records)
 
     @property
     def is_tracked(self) -> bool:
@@ -578,7 +589,15 @@ def _record(
         time=number(entry.get("time", float(index)), "time"),
         known_path="" if known_path is None else known_path.relative_to(folder).as_posix(),
         gain=(float(gain[0]), float(gain[1]), float(gain[2])),
+        clip=_clip(entry),
     )
+
+
+def _clip(entry: dict[str, Any]) -> int:
+    clip = number(entry.get("clip", 0), "clip", 0.0, float(MAX_CLIPS - 1))
+    if clip != int(clip):
+        raise CaptureError(f"clip is {clip:g}, expected a whole number", "number the clips from 0")
+    return int(clip)
 
 
 def _camera(entry: dict[str, Any], size: tuple[int, int]) -> Camera:
@@ -740,6 +759,8 @@ class CaptureWriter:
             said["known_path"] = f"known/{frame.name}.png"
             known = frame.known.byte().cpu().numpy() * np.uint8(255)
             Image.fromarray(known).save(self.file(said["known_path"]))
+        if frame.clip:
+            said["clip"] = frame.clip
         if not bool((frame.gain == 1).all()):
             said["gain"] = frame.gain.double().tolist()
         self._covariances.append(frame.covariance)

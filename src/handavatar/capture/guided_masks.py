@@ -37,7 +37,6 @@ from handavatar.capture.masks import (
 )
 from handavatar.capture.outlines import silhouette
 from handavatar.capture.tracking import TrackedHand
-from handavatar.capture.windows import window_camera
 from handavatar.geometry.cameras import project
 from handavatar.hand.rig import Rig
 
@@ -130,8 +129,7 @@ def placed_mesh(
         hand: whose window is meant.
     """
     window = hand.window
-    side = window.image.shape[0]
-    camera = window_camera(focal, window.picture_size, window.corner, side / window.scale, side)
+    camera = window.camera(focal)
     places = project(camera, vertices)[0].double().numpy()
     scale = camera.focal[0] / max(float(vertices[:, 2].median()), 0.02)
     line = wrist_line(places[rig.rim.numpy()], places.mean(0))
@@ -282,6 +280,20 @@ def find_guided_mask(
     quality = float(np.sqrt(edges * agreement))
     covered_share = float((cover & mesh.covered).sum() / max(1, int(mesh.covered.sum())))
     return GuidedMask(HandMask(pixels, level, quality), ~unknown, edges, agreement, covered_share)
+
+
+def guided_by_given(hand: TrackedHand, mesh: PlacedMesh, mask: HandMask) -> GuidedMask:
+    """A mask that the user gives: it is believed, wherever the camera saw.
+
+    Args:
+        hand: its window.
+        mesh: as fitted.
+        mask: of the window.
+    """
+    seen = inside_picture(hand.window)
+    before = mesh.wrist.before_pixels(len(seen)) > 0
+    _, agreement = _border_quality(hand.window.image, mask.pixels, mesh, before & seen)
+    return GuidedMask(mask, seen, 1.0, agreement, 0.0)
 
 
 def _cover(

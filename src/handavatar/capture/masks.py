@@ -462,17 +462,17 @@ def _blurred(
     values: Float[np.ndarray, "side side channels"], sigma: float
 ) -> Float[np.ndarray, "side side channels"]:
     """Under a Gaussian that ends after four standard deviations; mirrored at the border."""
-    cv2 = _opencv()
+    cv2 = load_opencv()
     return cv2.GaussianBlur(values, (0, 0), sigma, borderType=cv2.BORDER_REFLECT)
 
 
 def depth_inside(mask: Bool[np.ndarray, "side side"]) -> Float[np.ndarray, "side side"]:
     """Distance of each pixel of the mask from the nearest one that is not of it, pixels."""
-    cv2 = _opencv()
+    cv2 = load_opencv()
     return cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
 
 
-def _opencv() -> Any:
+def load_opencv() -> Any:
     """The package.
 
     Raises:
@@ -495,7 +495,7 @@ def graph_cut(
     Raises:
         CaptureError: OpenCV is not installed.
     """
-    cv2 = _opencv()
+    cv2 = load_opencv()
     if not (labels & 1).any() or (labels & 1).all():
         return (labels & 1).astype(bool)
     labels = labels.copy()

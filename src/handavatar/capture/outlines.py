@@ -82,20 +82,20 @@ class OutlineMatcher:
     """Finds :class:`OutlinePairs` between posed hands and the outlines of their masks."""
 
     def __init__(
-        self, rig: Rig, outlines: Sequence[MaskOutline], picture_size: tuple[int, int]
+        self, rig: Rig, outlines: Sequence[MaskOutline], principal_point: tuple[float, float]
     ) -> None:
-        """One outline per frame, in the order of the frames."""
+        """One outline per frame, in the order of the frames, of a camera with a principal point."""
         self._rig = rig
         self._outlines = outlines
-        self._picture_size = picture_size
-        self._center = np.array(picture_size) / 2
+        self._principal_point = principal_point
+        self._center = np.array(principal_point)
         self._rim = rig.rim.numpy()
         self._generator = np.random.default_rng(0)
 
     def chosen(self, frames: Int[Tensor, "chosen"]) -> "OutlineMatcher":
         """The same for some frames; they may repeat."""
         outlines = [self._outlines[frame] for frame in frames.tolist()]
-        return OutlineMatcher(self._rig, outlines, self._picture_size)
+        return OutlineMatcher(self._rig, outlines, self._principal_point)
 
     def __call__(self, vertices: Float[Tensor, "frames vertices 3"], focal: float) -> OutlinePairs:
         """Pairs for vertices in camera axes (metres) and a focal length (pixels)."""

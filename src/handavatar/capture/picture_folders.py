@@ -47,7 +47,7 @@ def frames_of(source: Path, sampling: Sampling, tell: Tell) -> Iterator[VideoFra
     Raises:
         CaptureError: there are no pictures, or some cannot be read.
     """
-    if source.is_dir() or (not source.is_file() and _is_pattern(source.name)):
+    if is_picture_source(source):
         return picture_frames(source, sampling, tell)
     return video_frames(source, sampling, tell)
 
@@ -66,7 +66,7 @@ def picture_frames(source: Path, sampling: Sampling, tell: Tell) -> Iterator[Vid
     Raises:
         CaptureError: there are no pictures, or one cannot be read.
     """
-    files = _picture_files(source, tell)
+    files = picture_files(source, tell)
     tell(f"pictures tell no times: they are taken as {sampling.fps:g} a second (--fps)")
     sizes = [_upright_size(file) for file in files]
     width, height = working_size(sizes)
@@ -85,15 +85,29 @@ def picture_frames(source: Path, sampling: Sampling, tell: Tell) -> Iterator[Vid
                 "(--max-frames)"
             )
             break
-        yield VideoFrame(number, time, _read(file, (width, height)))
+        yield VideoFrame(number, time, _read(file, (width, height)), file.name)
         taken += 1
+
+
+def is_picture_source(source: Path) -> bool:
+    """Whether a folder or a pattern is meant, and not a video."""
+    return source.is_dir() or (not source.is_file() and _is_pattern(source.name))
 
 
 def _is_pattern(name: str) -> bool:
     return any(sign in name for sign in "*?[") or _COUNTED.search(name) is not None
 
 
-def _picture_files(source: Path, tell: Tell) -> list[Path]:
+def picture_files(source: Path, tell: Tell) -> list[Path]:
+    """The files of a folder's or a pattern's pictures, in the order of the numbers in their names.
+
+    Args:
+        source: folder, ``folder/*.png``, or ``folder/frame_%04d.png``.
+        tell: called where files are no pictures.
+
+    Raises:
+        CaptureError: there are no pictures.
+    """
     if source.is_dir():
         folder, found = source, sorted(source.iterdir())
     elif _COUNTED.search(source.name):

@@ -17,7 +17,7 @@ from handavatar.capture.fitting import LANDMARK_ERROR, Observations
 from handavatar.capture.frames import FITTED_SIDE, LANDMARKS, Capture, Frame
 from handavatar.capture.masks import HandMask, mask_coverage
 from handavatar.capture.tracking import TrackedHand
-from handavatar.capture.windows import resized, window_camera
+from handavatar.capture.windows import resized
 from handavatar.fit.energy import Observation
 from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.fit.pictures import FramePicture
@@ -39,9 +39,7 @@ _COMPARED_SIDE = 224
 
 def window_view(hand: TrackedHand, focal: float) -> Camera:
     """The camera of a tracked hand's window; focal length in pixels of the whole picture."""
-    window = hand.window
-    side = window.image.shape[0]
-    return window_camera(focal, window.picture_size, window.corner, side / window.scale, side)
+    return hand.window.camera(focal)
 
 
 def see_landmarks(seen: Observations, fit: HandFit) -> list[LandmarkSightings]:
@@ -51,7 +49,7 @@ def see_landmarks(seen: Observations, fit: HandFit) -> list[LandmarkSightings]:
         seen: the tracker's landmarks.
         fit: focal length, and where landmarks lie beside joints.
     """
-    center = torch.tensor(seen.picture_size) / 2
+    center = torch.tensor(seen.principal_point)
     if seen.skin is None:
         vertices = torch.zeros(0, dtype=torch.long)
         places = seen.landmarks
@@ -85,6 +83,8 @@ def observe_hands(
     gains: Float[np.ndarray, "hands 3"],
     landmarks: Sequence[LandmarkSightings],
     focal: float,
+    camera_from_world: Float[Tensor, "hands 4 4"] | None = None,
+    start: float = 0.0,
 ) -> list[Observation]:
     """What every frame of a video says: landmarks, mask and colours of the hand's surroundings.
 
@@ -95,21 +95,26 @@ def observe_hands(
         gains: of the channels, frame by frame.
         landmarks: of the tracker.
         focal: length, pixels of the whole picture.
+        camera_from_world: OpenCV axes, metres; None where the camera's axes are the world's.
+        start: seconds that are added to their times.
     """
     found = []
     for number, (hand, mask, is_known) in enumerate(zip(hands, masks, known, strict=True)):
         window = hand.window
-        view = window_view(hand, focal)
-        side = min(_COMPARED_SIDE, view.width)
-        zoom = np.eye(2) * (view.width / side)
+        full = hand.window.image.shape[0]
+        side = min(_COMPARED_SIDE, full)
+        zoom = np.eye(2) * (full / side)
+        view = window_view(hand, focal).resized(side, side)
         picture = FramePicture.of(
-            view.resized(side, side),
+            view
+            if camera_from_world is None
+            else replace(view, camera_from_world=camera_from_world[number]),
             resized(torch.from_numpy(window.image).float() / 255, side),
             torch.from_numpy(mask_coverage(mask.level, zoom, np.zeros(2), side)).float(),
             resized(torch.from_numpy(is_known).float()[..., None], side)[..., 0] > 0.999,
             torch.from_numpy(gains[number]).float(),
         )
-        found.append(Observation(picture, hand.time, landmarks[number]))
+        found.append(Observation(picture, start + hand.time, landmarks[number]))
     return found
 
 
@@ -121,6 +126,8 @@ def register_hands(
     progress: Callable[[float], None] | None = None,
 ) -> tuple[HandFit, Registered]:
     """Goes on from a fit with all that the frames say; the focal length stays as it is.
+
+    The fit's poses are in the axes of the observations' world.
 
     Args:
         rig: that is laid onto the pictures.

@@ -163,6 +163,36 @@ class Track:
     notes: tuple[str, ...] = ()
     is_own: bool = False
 
+    def with_principal_point(self, place: tuple[float, float]) -> "Track":
+        """The same, of a camera that is known.
+
+        Args:
+            place: pixels of the pictures as they were filmed, not mirrored.
+        """
+        x, y = place
+        if self.side == "left":
+            x = self.picture_size[0] - x
+
+        def known(window: Window) -> Window:
+            return replace(window, principal_point=(x, y))
+
+        hands = [
+            replace(
+                hand,
+                window=known(hand.window),
+                fine=None if hand.fine is None else known(hand.fine),
+            )
+            for hand in self.hands
+        ]
+        return replace(self, hands=tuple(hands))
+
+    @property
+    def principal_point(self) -> tuple[float, float]:
+        """Of the camera, pixels of the pictures; their middle where nobody said otherwise."""
+        if self.hands:
+            return self.hands[0].window.principal_point
+        return self.picture_size[0] / 2, self.picture_size[1] / 2
+
 
 class UnusableTrackError(CaptureError):
     """No hand to go on with.

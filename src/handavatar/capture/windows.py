@@ -30,12 +30,20 @@ class Window:
         corner: upper left corner (x, y) in the picture.
         scale: window pixels per picture pixel.
         picture_size: width and height of the whole picture, pixels.
+        principal_point: of the whole picture's camera, pixels; its middle if it is left out.
     """
 
     image: UInt8[np.ndarray, "side side 3"]
     corner: tuple[float, float]
     scale: float
     picture_size: tuple[int, int]
+    principal_point: tuple[float, float] = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        """Fills in what most cameras need not say."""
+        if self.principal_point is None:
+            width, height = self.picture_size
+            object.__setattr__(self, "principal_point", (width / 2, height / 2))
 
     def from_picture(self, points: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
         """Picture points in window pixels."""
@@ -48,12 +56,25 @@ class Window:
             self,
             image=np.ascontiguousarray(self.image[:, ::-1]),
             corner=(self.picture_size[0] - self.corner[0] - side, self.corner[1]),
+            principal_point=(
+                self.picture_size[0] - self.principal_point[0],
+                self.principal_point[1],
+            ),
         )
+
+    def camera(self, focal: float) -> Camera:
+        """Of this window, at its own number of pixels.
+
+        Args:
+            focal: length, pixels of the whole picture.
+        """
+        pixels = self.image.shape[0]
+        return window_camera(focal, self.principal_point, self.corner, pixels / self.scale, pixels)
 
 
 def window_camera(
     focal: float,
-    picture_size: tuple[int, int],
+    principal_point: tuple[float, float],
     corner: tuple[float, float],
     side: float,
     pixels: int,
@@ -62,13 +83,13 @@ def window_camera(
 
     Args:
         focal: of the picture, pixels.
-        picture_size: width and height, pixels.
+        principal_point: of the picture, pixels.
         corner: upper left corner of the piece, pixels of the picture.
         side: of the piece, pixels of the picture.
         pixels: of the result.
     """
     scale = pixels / side
-    center = [(size / 2 - start) * scale for size, start in zip(picture_size, corner, strict=True)]
+    center = [(at - start) * scale for at, start in zip(principal_point, corner, strict=True)]
     return Camera((focal * scale,) * 2, (center[0], center[1]), pixels, pixels, torch.eye(4))
 
 

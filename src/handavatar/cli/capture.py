@@ -12,18 +12,19 @@ if TYPE_CHECKING:
 
 
 def video(words: list[str]) -> int:
-    """A video of one bare hand -> capture: track, mask, fit pose and shape."""
+    """A video of one bare hand (or several) -> capture: track, mask, fit pose and shape."""
     from handavatar.capture.video import VideoOptions
     from handavatar.cli.arguments import parse
 
-    options = parse(VideoOptions, words, "capture video", positional=("file",))
+    options = parse(VideoOptions, words, "capture video", positional=("file", "more"))
     for asked in options.of_each_hand():
         _capture_hand(asked)
     return 0
 
 
 def _capture_hand(options: "VideoOptions") -> None:
-    from handavatar.capture.video import capture_video, summary_lines
+    from handavatar.capture.video import capture_video
+    from handavatar.capture.video_report import summary_lines
     from handavatar.train.progress import Progress
 
     with Progress("capture video", 100) as progress:

@@ -7,7 +7,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from handavatar.geometry.rotations import left_jacobian, matrix_from_axis_angle, rigid_transform
+from handavatar.geometry.rotations import (
+    axis_angle_from_matrix,
+    left_jacobian,
+    matrix_from_axis_angle,
+    rigid_transform,
+)
 
 BONE_NAMES: tuple[str, ...] = (
     "wrist",
@@ -61,6 +66,23 @@ class HandPose:
         return replace(
             self, rotations=self.rotations.to(device), translation=self.translation.to(device)
         )
+
+    def moved_to(
+        self, target_from_source: Float[Tensor, "*batch 4 4"], wrist: Float[Tensor, "3"]
+    ) -> "HandPose":
+        """The same hand in other axes.
+
+        Args:
+            target_from_source: rigid; the pose is given in the source's axes.
+            wrist: rest wrist joint, metres: about it the hand turns, not about the origin.
+        """
+        turn = target_from_source[..., :3, :3]
+        first = turn @ matrix_from_axis_angle(self.rotations[..., 0, :])
+        rotations = torch.cat(
+            [axis_angle_from_matrix(first)[..., None, :], self.rotations[..., 1:, :]], dim=-2
+        )
+        place = (turn @ (self.translation + wrist)[..., None])[..., 0]
+        return HandPose(rotations, place + target_from_source[..., :3, 3] - wrist)
 
 
 def bone_transforms(

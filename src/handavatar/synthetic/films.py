@@ -51,6 +51,7 @@ _SHADOW_STEP = 4
 # Fingers up, palm to the camera, of a hand whose fingers lie along -x and whose back is +y.
 _PALM_VIEW = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 _NOT_YET_SMOOTH = 0.7
+_TAKES_APART = 7919
 
 
 @dataclass(frozen=True)
@@ -97,6 +98,8 @@ class FilmOptions:
     """strength of the displacement that shape coefficients cannot express"""
     rig: str = "open-hand"
     """the hand"""
+    take: int = 0
+    """another recording of the same subject: its own light, motion, background and noise"""
 
     def __post_init__(self) -> None:
         """Refuses what cannot be made."""
@@ -118,6 +121,11 @@ class FilmOptions:
     def num_frames(self) -> int:
         """Pictures of the film."""
         return round(self.seconds * self.fps)
+
+    def random(self, purpose: int) -> np.random.Generator:
+        """Random numbers of this take for one purpose."""
+        # The first take is as films were before there were others.
+        return np.random.default_rng([self.seed, purpose, *([self.take] if self.take else [])])
 
 
 FILMS: tuple[FilmOptions, ...] = (
@@ -246,8 +254,8 @@ def natural_motion(rig: Rig, options: FilmOptions) -> Motion:
         rig: whose joints move.
         options: gestures, view, length.
     """
-    random = np.random.default_rng([options.seed, 31])
-    generator = torch.Generator().manual_seed(options.seed)
+    random = options.random(31)
+    generator = torch.Generator().manual_seed(options.seed + _TAKES_APART * options.take)
     frames = options.num_frames
     keys = [gesture(rig, name) for name in options.gestures]
     for index, pose in enumerate(sample_poses(rig, 2, generator)):
@@ -307,7 +315,7 @@ def _eased(share: Tensor) -> Tensor:
 
 def drifting_gains(options: FilmOptions) -> Float[Tensor, "frames 3"]:
     """Exposure times white balance of every picture: factors of linear light, 1 in the mean."""
-    random = np.random.default_rng([options.seed, 32])
+    random = options.random(32)
     time = np.arange(options.num_frames) / options.fps
     phases = random.uniform(0, 2 * np.pi, 4)
     exposure = 0.7 * np.sin(2 * np.pi * time / 5.1 + phases[0])
@@ -322,7 +330,7 @@ class _Stage:
 
     def __init__(self, options: FilmOptions, base: Rig) -> None:
         self.options = options
-        random = np.random.default_rng([options.seed, 33])
+        random = options.random(33)
         made = SynthOptions(
             seed=options.seed, tone=options.tone, personal=options.personal, subdivisions=1
         )
