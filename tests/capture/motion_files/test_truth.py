@@ -30,6 +30,7 @@ from layout_files import (
 from mano_files import hand_fields
 
 from handavatar.capture.motion import Motion, read_motion
+from handavatar.capture.motion_files.trackers import is_hawor
 from handavatar.cli import main
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.mano import read_mano
@@ -413,6 +414,10 @@ def test_chunks_of_hawor_come_one_after_another(truth: Truth, tmp_path: Path) ->
     folder = write_hawor(tmp_path, halves[1], 43)
     motion = convert(folder, *RATE, rig=f"mano-{truth.side}")
     assert largest_error(motion, truth) < 1e-5
+    assert is_hawor(folder, {})
+    (tmp_path / "pictures" / "0").mkdir(parents=True)
+    (tmp_path / "pictures" / "0" / "notes.json").write_text("{}")
+    assert not is_hawor(tmp_path / "pictures", {})
     single = folder / str(int(truth.side == "right")) / "43_45.json"
     motion = convert(single, *RATE, rig=f"mano-{truth.side}")
     assert largest_error(motion, halves[1]) < 1e-5

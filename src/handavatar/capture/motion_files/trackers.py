@@ -224,5 +224,9 @@ def _hawor_side(path: Path, conventions: Conventions, count: int) -> Tensor:
 def is_hawor(source: Path, fields: dict[str, object]) -> bool:
     """Whether a file, or a folder, is of HaWoR for certain."""
     if source.is_dir():
-        return any((source / name).is_dir() for name in ("0", "1"))
+        return any(
+            _CHUNK.fullmatch(path.stem) is not None
+            for name in ("0", "1")
+            for path in (source / name).glob("*.json")
+        )
     return all(isinstance(fields.get(name), np.ndarray) for name in _HAWOR[:2])
