@@ -42,7 +42,7 @@ def measure(path: Path, size: int) -> dict[str, float]:
         name: torch.from_numpy(np.array(Image.open(io.BytesIO(made.base_color)))) / 255
         for name, made in textures.items()
     }
-    motion = named_motion(avatar.base_rig, "gestures", start_of(avatar.info.get("view")))
+    motion = named_motion(avatar.base_rig, "gestures", start_of(avatar.view()))
     poses = [motion.pose(step) for step in torch.linspace(0, len(motion) - 1, POSES).long()]
     camera = camera_on(avatar, poses, size)
     found: dict[str, list[float]] = {name: [] for name in (*textures, "outline_iou")}

@@ -81,7 +81,7 @@ class Shot:
 
 
 def shots(avatar: HandAvatar, size: int) -> list[Shot]:
-    rig, start = avatar.base_rig, start_of(avatar.info.get("view"))
+    rig, start = avatar.base_rig, start_of(avatar.view())
     generator = torch.Generator().manual_seed(2026)
     fingers = resolve_penetration(rig, sample_poses(rig, RANDOM, generator))
     wrists = start.rotations[0] + 0.15 * torch.randn(RANDOM, 3, generator=generator)

@@ -15,6 +15,8 @@ import torch
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame, write_capture
+from handavatar.capture.view import view_of
+from handavatar.field.shading import OrientedCues
 from handavatar.geometry.cameras import Camera, look_at
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.hand.open_hand import load_open_hand
@@ -71,10 +73,21 @@ def camera_above(size: int, distance: float = 0.42) -> Camera:
     return Camera((1.7 * size, 1.7 * size), (size / 2, size / 2), size, size, placed)
 
 
+LIGHTS = ((0.3, 0.9, 0.3), (0.2, 0.25, -0.95))
+"""Of the frames' clips: towards each clip's own light, world."""
+SKIN = (0.9, 0.65, 0.5)
+"""Of the frames: their only albedo."""
+
+
 def lit_frame(
-    index: int, split: str, confidence: float = 1.0, size: int = 48, rig: Rig | None = None
+    index: int,
+    split: str,
+    confidence: float = 1.0,
+    size: int = 48,
+    rig: Rig | None = None,
+    clip: int = 0,
 ) -> Frame:
-    """The rasterised open hand, or that of another rig, skin-coloured, under one light."""
+    """The rasterised open hand, or that of another rig, skin-coloured, under its clip's light."""
     pose, camera = bent_pose(index), camera_above(size)
     if rig is not None:  # Its wrist may lie elsewhere.
         pose = replace(pose, translation=pose.translation - rig.shaped().rest_joints[0])
@@ -82,10 +95,10 @@ def lit_frame(
     faces = posed.rig.faces
     fragments = rasterize(posed.vertices, faces, camera)
     normals = interpolate(fragments, faces, vertex_normals(posed.vertices, faces))
-    light = (normals @ torch.tensor([0.3, 0.9, 0.3])).clamp(0, 1) * 0.7 + 0.2
-    color = light[..., None] * torch.tensor([0.9, 0.65, 0.5]) * fragments.mask[..., None]
+    light = (normals @ torch.tensor(LIGHTS[clip])).clamp(0, 1) * 0.7 + 0.2
+    color = light[..., None] * torch.tensor(SKIN) * fragments.mask[..., None]
     return Frame(
-        name=f"{index:06d}",
+        name=f"{index + 1000 * clip:06d}",
         image=(color * 255).round().to(torch.uint8),
         coverage=fragments.mask.byte() * 255,
         camera=camera,
@@ -93,6 +106,7 @@ def lit_frame(
         confidence=confidence,
         split=split,
         time=index / 30,
+        clip=clip,
     )
 
 
@@ -102,11 +116,16 @@ def write_tiny_capture(
     confidence: float = 1.0,
     rig: Rig | None = None,
     size: int = 48,
+    num_clips: int = 1,
     **header: str,
 ) -> Path:
-    """A capture of small pictures: ``a`` stands for a training frame, ``b`` for a test frame."""
+    """A capture of small pictures: ``a`` stands for a training frame, ``b`` for a test frame.
+
+    Every clip shows the same poses, under its own light.
+    """
     frames = [
-        lit_frame(index, {"a": "train", "b": "test"}[letter], confidence, size, rig)
+        lit_frame(index, {"a": "train", "b": "test"}[letter], confidence, size, rig, clip)
+        for clip in range(num_clips)
         for index, letter in enumerate(splits)
     ]
     rig = rig or load_open_hand()
@@ -191,6 +210,29 @@ def small_avatar() -> HandAvatar:
     with torch.no_grad():  # Colours and shadows that differ from place to place.
         avatar.albedo.codes.mul_(10)
         avatar.shape.mlp.output.weight.mul_(100 / math.sqrt(3))
+    return avatar
+
+
+@pytest.fixture(scope="session")
+def two_lights() -> HandAvatar:
+    """A small avatar of two clips, which differ in their light and in their world; read only."""
+    turned = replace(camera_above(48), camera_from_world=torch.diag(torch.tensor([-1.0, 1, -1, 1])))
+    turned.camera_from_world[2, 3] = 0.5
+    frames = [lit_frame(0, "train"), replace(lit_frame(3, "train", clip=1), camera=turned)]
+    views = [view_of([frame]) for frame in frames]
+    torch.manual_seed(0)
+    avatar = HandAvatar(
+        load_open_hand("778"),
+        torch.zeros(10),
+        rounds=0,
+        num_anchors=128,
+        cues=OrientedCues(),
+        info={"side": "right", "view": views[0], "views": views},
+        num_lights=2,
+    )
+    load_prior(avatar.occupancy)
+    with torch.no_grad():  # Lights that differ clearly, and from place to place.
+        avatar.illumination.mlp.hidden[0].weight[:, -2:].mul_(20)
     return avatar
 
 

@@ -19,6 +19,7 @@ from handavatar import cli
 from handavatar.animate import (
     PASSES,
     RenderOptions,
+    _what_frames_depend_on,
     camera_on,
     orbited,
     pass_pictures,
@@ -28,7 +29,9 @@ from handavatar.animate import (
 )
 from handavatar.avatar import CheckpointError, HandAvatar, Rendering, RenderSettings
 from handavatar.capture.frames import CaptureError
-from handavatar.capture.motion import gesture
+from handavatar.capture.motion import gesture, named_motion
+from handavatar.capture.view import start_of
+from handavatar.edit import Edit
 from handavatar.geometry.cameras import project
 from handavatar.hand.pose import HandPose
 from handavatar.jobs.files import MARKER, FolderInUse
@@ -392,3 +395,31 @@ def test_orbiting_keeps_the_centre_in_place_and_comes_round() -> None:
         atol=1e-5,
         rtol=0,
     )
+
+
+def test_a_motion_is_rendered_in_the_light_and_the_view_of_a_clip(
+    two_lights: HandAvatar, tmp_path: Path
+) -> None:
+    two_lights.save(tmp_path / "two.safetensors")
+    plain = _options(tmp_path / "two.safetensors", Path("turn"), tmp_path / "plain", frames=1)
+    second = replace(plain, out=tmp_path / "second", light=1)
+    edit = Edit(light=1)
+    for options, look in ((plain, Edit()), (second, edit)):
+        found = np.asarray(Image.open(render_motion(options) / "rgb" / "000000.png"))
+        start = start_of(two_lights.view(look))
+        pose = named_motion(two_lights.base_rig, "turn", start).pose(0)
+        camera = camera_on(two_lights, [pose], SIZE, edit=look)
+        view = two_lights.info["views"][0 if look.light is None else 1]
+        assert camera.camera_from_world.tolist() == view["camera_from_world"]
+        settings = RenderSettings(num_samples=16)
+        rendering = two_lights.render(pose, camera, look, settings)
+        assert np.array_equal(found, pass_pictures(rendering)["rgb"])
+    with pytest.raises(ValueError, match=r"light 2: .* choose from 0, 1"):
+        render_motion(replace(plain, out=tmp_path / "third", light=2))
+    assert not (tmp_path / "third").exists()
+    # What an interrupted command left is not taken for another light's.
+    told = [
+        _what_frames_depend_on(two_lights, Edit(light=light), plain, [], [])["sha256"]
+        for light in (0, 1, None)
+    ]
+    assert told[0] == told[2] != told[1]

@@ -1,5 +1,6 @@
 """The avatar: laws of pictures, edits, broken files."""
 
+import copy
 import json
 import math
 from dataclasses import replace
@@ -32,6 +33,7 @@ from handavatar.hand.parts import POINT_ROUNDS, divide_into_parts
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import Rig
+from handavatar.plain import plain_rays
 from handavatar.train.prior import load_prior
 
 FEW = RenderSettings(num_samples=24)
@@ -530,3 +532,72 @@ def test_detail_is_saved_and_read_back(small_avatar: HandAvatar, tmp_path: Path)
         )
     assert small_avatar.texture is None
     assert detailed.reloaded(tmp_path / "plain.safetensors").texture is None
+
+
+def test_an_avatar_of_two_clips_is_shown_in_either_light(
+    two_lights: HandAvatar, tmp_path: Path
+) -> None:
+    def shown(avatar: HandAvatar, edit: Edit | None = None) -> Rendering:
+        return avatar.render(bent_pose(2), camera_above(24), edit, RenderSettings(num_samples=24))
+
+    first, second = shown(two_lights), shown(two_lights, Edit(light=1))
+    assert torch.equal(first.albedo, second.albedo) and torch.equal(first.alpha, second.alpha)
+    assert float((first.illumination - second.illumination).abs().max()) > 0.05
+    assert torch.equal(first.color, shown(two_lights, Edit(light=0)).color)
+    edited = copy.copy(two_lights)
+    edited.edit = Edit(light=1)
+    edited.save(tmp_path / "second.safetensors")
+    read = HandAvatar.load(tmp_path / "second.safetensors")
+    assert (read.num_lights, read.light_of(), read.edit) == (2, 1, Edit(light=1))
+    assert torch.equal(shown(read).color, second.color)
+    assert torch.equal(shown(read, Edit(light=0)).color, first.color)
+    assert read.view() == two_lights.info["views"][1]
+    assert read.view(Edit(light=0)) == two_lights.view() == two_lights.info["view"]
+    batch = two_lights.render_batch(
+        [bent_pose(2)] * 2,
+        [camera_above(24)] * 2,
+        [Edit(light=1), Edit()],
+        RenderSettings(num_samples=24),
+    )
+    assert torch.equal(batch[0].color, second.color) and torch.equal(batch[1].color, first.color)
+    with pytest.raises(ValueError, match="2 poses and 1 edits"):
+        two_lights.render_batch([bent_pose(2)] * 2, [camera_above(24)] * 2, [Edit()])
+
+
+def test_the_slow_rendering_is_in_the_avatars_light(two_lights: HandAvatar) -> None:
+    edited = copy.copy(two_lights)
+    edited.edit = Edit(light=1)
+    camera = camera_above(6)
+    rays = rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1))
+    with torch.no_grad():
+        state = edited.prepare(bent_pose(2))
+        slow = plain_rays(edited, state, rays, num_samples=24)
+        exact = replace(EXACT, num_samples=24)
+        fast = edited.render_rays(state, rays, exact)
+        other = two_lights.render_rays(state, rays, exact)
+    torch.testing.assert_close(slow.illumination, fast.illumination, atol=1e-4, rtol=1e-4)
+    assert float((slow.illumination - other.illumination).abs().max()) > 0.05
+
+
+def test_a_light_that_there_is_not_is_refused_by_its_number(
+    two_lights: HandAvatar, small_avatar: HandAvatar, tmp_path: Path
+) -> None:
+    for avatar, light, known in ((two_lights, 2, "0, 1"), (small_avatar, 1, "0")):
+        message = f"light {light}: this avatar has none of that number; choose from {known} "
+        with pytest.raises(ValueError, match=message):
+            avatar.light_of(Edit(light=light))
+        with pytest.raises(ValueError, match=message):
+            avatar.render(bent_pose(1), camera_above(8), Edit(light=light))
+    edited = copy.copy(two_lights)
+    edited.edit = Edit(light=7)
+    edited.save(tmp_path / "seventh.safetensors")
+    with pytest.raises(CheckpointError, match="light 7"):
+        HandAvatar.load(tmp_path / "seventh.safetensors")
+
+
+def test_the_file_of_one_light_says_nothing_of_lights(file: Path) -> None:
+    with safe_open(file, "pt") as opened:
+        about = json.loads(opened.metadata()["handavatar"])
+    assert about["edit"].keys() == {"light_gain", "albedo_shift", "lifted_bones"}
+    assert not [name for name in about if "light" in name]
+    assert HandAvatar.load(file).num_lights == 1

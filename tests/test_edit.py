@@ -65,6 +65,8 @@ def test_edits_follow_one_another() -> None:
     torch.testing.assert_close(both.paint.opacity, torch.full((3,), 0.75))
     torch.testing.assert_close(both.paint.colors, torch.full((3, 3), 1 / 3))
     assert Edit().then(first) == first and first.then(Edit()) == first
+    assert Edit(light=1).then(first).light == 1
+    assert Edit(light=1).then(Edit(light=0)).light == 0
 
 
 def test_fingers_and_bones_are_known_by_name() -> None:

@@ -38,8 +38,10 @@ MAY_IMPORT = {
             "geometry jobs hand fit capture field render edit avatar alignment plain animate "
             "retouch"
         ),
+        # An edit says in which clip's light a frame is seen.
         "train": (
-            "geometry jobs hand fit capture field render avatar plain alignment evaluate processes"
+            "geometry jobs hand fit capture field render edit avatar plain alignment evaluate "
+            "processes"
         ),
         # Made videos with truth: a subject of the made captures before a background.
         "synthetic": "geometry jobs hand capture render tracker",

@@ -113,3 +113,24 @@ def test_a_picture_that_is_no_paint_is_refused(small_avatar: HandAvatar, tmp_pat
 def test_words_that_mean_nothing_are_refused(look: Look, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         look.check_look()
+
+
+def test_the_light_of_a_clip_is_saved_and_another_one_shown_on_top(
+    two_lights: HandAvatar, small_avatar: HandAvatar, tmp_path: Path
+) -> None:
+    two_lights.save(tmp_path / "two.safetensors")
+    saved = save_edited(
+        EditOptions(tmp_path / "two.safetensors", tmp_path / "second.safetensors", light=1)
+    )
+    second = HandAvatar.load(saved)
+    assert torch.equal(_seen(second).color, _seen(two_lights, Edit(light=1)).color)
+    # Other edits leave the light; another light takes its place.
+    dimmed = EditOptions(saved, tmp_path / "dimmed.safetensors", light_gain=0.5)
+    assert HandAvatar.load(save_edited(dimmed)).edit == Edit(0.5, light=1)
+    assert torch.equal(_seen(second, Look(light=0).edit_on(second)).color, _seen(two_lights).color)
+    out = tmp_path / "third.safetensors"
+    with pytest.raises(ValueError, match=r"light 2: .* choose from 0, 1"):
+        save_edited(EditOptions(saved, out, light=2))
+    assert not out.exists()
+    with pytest.raises(ValueError, match=r"light 1: .* choose from 0 "):
+        Look(light=1).edit_on(small_avatar)

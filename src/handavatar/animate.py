@@ -124,10 +124,10 @@ def render_motion(options: RenderOptions) -> Path:
     kernel = chosen_kernel(options.kernel, device)
     avatar = HandAvatar.load(options.run)
     edit = options.edit_on(avatar)
-    start = start_of(avatar.info.get("view"))
+    start = start_of(avatar.view(edit))
     motion = open_motion(options.motion, avatar.base_rig.to("cpu"), start)
     poses = [motion.pose(step) for step in _spread(len(motion), options.frames)]
-    camera = camera_on(avatar, poses, options.size)
+    camera = camera_on(avatar, poses, options.size, edit=edit)
     views = [camera] * len(poses)
     if options.orbit:
         middle = _middle(avatar, poses[0])
@@ -219,10 +219,12 @@ def _what_frames_depend_on(
     views: list[Camera],
 ) -> dict[str, Any]:
     """The options but for where and how often; a fingerprint of avatar, look, poses and cameras."""
-    elsewhere = ("run", "motion", "out", "frames", "orbit", "overwrite", "device", "paint")
+    elsewhere = ("run", "motion", "out", "frames", "orbit", "overwrite", "device", "paint", "light")
     digest = sha256()
     look = avatar.edit.then(edit)
     digest.update(repr((look.light_gain, look.albedo_shift, look.lifted_bones)).encode())
+    if avatar.num_lights > 1:
+        digest.update(repr(avatar.light_of(edit)).encode())
     tensors = [value for _, value in sorted(avatar.state_dict().items())]
     if look.paint is not None:
         tensors += [look.paint.colors, look.paint.opacity]
@@ -275,13 +277,19 @@ def posed_as_seen(avatar: HandAvatar, fingers: str | Float[Tensor, "bones 3"]) -
     Raises:
         CaptureError: for a name that no gesture has.
     """
-    start = start_of(avatar.info.get("view"))
+    start = start_of(avatar.view())
     if isinstance(fingers, str):
         fingers = gesture(avatar.base_rig.to("cpu"), fingers)
     return replace(start, rotations=torch.cat([start.rotations[:1], fingers[1:].cpu()]))
 
 
-def camera_on(avatar: HandAvatar, poses: list[HandPose], size: int, room: float = 0.15) -> Camera:
+def camera_on(
+    avatar: HandAvatar,
+    poses: list[HandPose],
+    size: int,
+    room: float = 0.15,
+    edit: Edit | None = None,
+) -> Camera:
     """A square camera where the capture's was, that holds the hand in all the poses.
 
     Args:
@@ -290,12 +298,13 @@ def camera_on(avatar: HandAvatar, poses: list[HandPose], size: int, room: float 
         size: pixels along a side.
         room: around the hand, as a share of its longer side, half of it on either side. A camera
             that is to be carried around the hand needs more, for from there it may reach farther.
+        edit: on top of the avatar's own: of several clips, its light says whose camera.
     """
     with torch.no_grad():
         rest = avatar.rig.to("cpu").shaped(avatar.coefficients.cpu())
         points = torch.cat([rest.posed(pose).vertices for pose in poses])
     middle = _middle(avatar, poses[0])
-    return camera_holding(avatar.info.get("view"), points, middle, size, room)
+    return camera_holding(avatar.view(edit), points, middle, size, room)
 
 
 def orbited(camera: Camera, center: Tensor, angle: float) -> Camera:

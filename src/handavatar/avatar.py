@@ -74,7 +74,14 @@ def _stored_edit(about: dict[str, Any], tensors: dict[str, Tensor]) -> Edit:
     paint = None
     if "paint.colors" in tensors:
         paint = Paint(tensors["paint.colors"], tensors["paint.opacity"])
-    return Edit(float(about["light_gain"]), (red, green, blue), bones, paint)
+    light = about.get("light")
+    return Edit(
+        float(about["light_gain"]),
+        (red, green, blue),
+        bones,
+        paint,
+        None if light is None else int(light),
+    )
 
 
 def chosen_device(name: str) -> torch.device:
@@ -257,6 +264,7 @@ class HandAvatar(nn.Module):
         anchors: SurfacePoints | None = None,
         cues: CueSet | None = None,
         info: dict[str, Any] | None = None,
+        num_lights: int = 1,
     ) -> None:
         """An untrained avatar.
 
@@ -268,6 +276,7 @@ class HandAvatar(nn.Module):
             anchors: anchors to use instead of placing new ones (when loading).
             cues: what the illumination depends on; by default the paper's.
             info: facts that travel with the avatar (side, subject, method, ...).
+            num_lights: one for each clip of the capture; shape and albedo are the same in all.
         """
         super().__init__()
         self.base_rig = rig
@@ -287,7 +296,7 @@ class HandAvatar(nn.Module):
         self.occupancy = PairOccupancy()
         self.albedo = AlbedoField(len(anchors.faces))
         self.illumination = IlluminationField(
-            anchors.positions(self.rig.template_vertices), cues or PaperCues()
+            anchors.positions(self.rig.template_vertices), cues or PaperCues(), num_lights
         )
         self.texture = None
         self._replay: Replay[HandState] = Replay()
@@ -303,6 +312,44 @@ class HandAvatar(nn.Module):
     def anchors(self) -> SurfacePoints:
         """The anchors as points on the rig's faces, which any values at vertices reach."""
         return SurfacePoints(self.anchor_corners, self.anchor_barycentric)
+
+    @property
+    def num_lights(self) -> int:
+        """One for each clip of the capture."""
+        return self.illumination.num_lights
+
+    def light_of(self, edit: Edit | None = None) -> int:
+        """Number of the light in which an edit shows the avatar.
+
+        Args:
+            edit: on top of the avatar's own.
+
+        Raises:
+            ValueError: if the avatar has no light of that number.
+        """
+        chosen = None if edit is None else edit.light
+        light = (self.edit.light if chosen is None else chosen) or 0
+        if not 0 <= light < self.num_lights:
+            known = ", ".join(map(str, range(self.num_lights)))
+            raise ValueError(
+                f"light {light}: this avatar has none of that number; choose from {known} "
+                "(one for each clip of its capture)"
+            )
+        return light
+
+    def view(self, edit: Edit | None = None) -> dict[str, Any] | None:
+        """Where the capture typically saw the hand, in the light of an edit; None if unknown.
+
+        Every clip has a world of its own, in which its light stands.
+
+        Args:
+            edit: on top of the avatar's own.
+
+        Returns:
+            As :func:`handavatar.capture.view.view_of` made it.
+        """
+        views = self.info.get("views")
+        return views[self.light_of(edit)] if views else self.info.get("view")
 
     def moved_to(self, device: torch.device | str) -> "HandAvatar":
         """Moves weights, rig, parts and paint; returns itself."""
@@ -471,6 +518,7 @@ class HandAvatar(nn.Module):
                 edit.of_directed(seen.directed),
                 normals,
                 seen.neighbours.interpolated(state.light),
+                self.light_of(edit),
             )
         )
         values = torch.cat(
@@ -705,30 +753,46 @@ class HandAvatar(nn.Module):
         self,
         poses: Sequence[HandPose],
         cameras: Sequence[Camera],
-        edit: Edit | None = None,
+        edit: Edit | Sequence[Edit] | None = None,
         settings: RenderSettings | None = None,
     ) -> list[Rendering]:
         """The pictures that :meth:`render` makes one by one; on a CPU side by side, a thread each.
 
         What the pictures of a pose share is done once, if it is the same object every time.
 
+        Args:
+            poses: of the hand in the world.
+            cameras: one for each pose.
+            edit: changes of the look; one for all, or one for each pose.
+            settings: samples and bounds.
+
         Raises:
-            ValueError: if there are not as many cameras as poses.
+            ValueError: if there are not as many cameras, or edits, as poses.
         """
         if len(poses) != len(cameras):
             raise ValueError(
                 f"render_batch: found {len(poses)} poses and {len(cameras)} cameras, expected as "
                 "many of both"
             )
-        lifted_bones = edit.lifted_bones if edit else ()
+        edits = [edit or Edit()] * len(poses) if edit is None or isinstance(edit, Edit) else edit
+        if len(edits) != len(poses):
+            raise ValueError(
+                f"render_batch: found {len(poses)} poses and {len(edits)} edits, expected as many "
+                "of both"
+            )
         settings = settings or RenderSettings()
+        keys = [(id(pose), one.lifted_bones) for pose, one in zip(poses, edits, strict=True)]
+        wanted = dict(zip(keys, zip(poses, edits, strict=True), strict=True))
         states = mapped(
-            lambda pose: self.prepare(pose.to(self.device), lifted_bones),
-            {id(pose): pose for pose in poses}.values(),
+            lambda pair: self.prepare(pair[0].to(self.device), pair[1].lifted_bones),
+            wanted.values(),
         )
-        state_of = dict(zip(dict.fromkeys(map(id, poses)), states, strict=True))
-        views = [(state_of[id(pose)], camera) for pose, camera in zip(poses, cameras, strict=True)]
-        return mapped(lambda view: self._picture(*view, edit, settings), views)
+        state_of = dict(zip(wanted, states, strict=True))
+        views = [
+            (state_of[key], camera, one)
+            for key, camera, one in zip(keys, cameras, edits, strict=True)
+        ]
+        return mapped(lambda view: self._picture(*view, settings), views)
 
     def at_pixels(
         self,
@@ -812,7 +876,7 @@ class HandAvatar(nn.Module):
                 tensors["rig.pose_directions"] = self.base_rig.pose_directions
         if self.edit.paint is not None:
             tensors |= {f"paint.{name}": value for name, value in vars(self.edit.paint).items()}
-        about = {
+        about: dict[str, Any] = {
             "schema": SCHEMA,
             "rig": self.base_rig.name,
             "rig_sha256": self.base_rig.sha256,
@@ -829,6 +893,8 @@ class HandAvatar(nn.Module):
             },
             "info": self.info,
         }
+        if self.edit.light is not None:
+            about["edit"]["light"] = self.edit.light
         path.parent.mkdir(parents=True, exist_ok=True)
         aside = path.with_name(path.name + ".tmp")
         stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
@@ -854,12 +920,15 @@ class HandAvatar(nn.Module):
             rig = licensed_rig or _stored_rig(about["rig"], tensors)
             state = {name[7:]: v for name, v in tensors.items() if name.startswith("avatar.")}
             anchors = SurfacePoints(state["anchor_corners"], state["anchor_barycentric"])
+            cues = cue_set(about["cues"], len(state["illumination.directions"]))
+            columns = state["illumination.mlp.hidden.0.weight"].shape[1] - cues.width
             avatar = HandAvatar(
                 rig,
                 state["coefficients"],
                 rounds=about["rounds"],
                 anchors=anchors,
-                cues=cue_set(about["cues"], len(state["illumination.directions"])),
+                cues=cues,
+                num_lights=max(columns, 1),
             )
             avatar._restore(about, tensors)
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -904,6 +973,7 @@ class HandAvatar(nn.Module):
         )
         self.load_state_dict(state)
         self.edit = _stored_edit(about["edit"], tensors)
+        self.light_of()
 
 
 def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:

@@ -40,6 +40,8 @@ class Edit:
         lifted_bones: bones that cast no shadow: their directed soft occupancy is set to zero, or
             light is traced to a hand without them.
         paint: on the skin, over the shifted albedo; None is none.
+        light: in which of the avatar's lights it is shown: the number of a clip of its capture;
+            None leaves that as it is, which is the first one's where nobody chose.
 
     Source: paper supplement (texture editing).
     """
@@ -48,6 +50,7 @@ class Edit:
     albedo_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     lifted_bones: tuple[int, ...] = ()
     paint: Paint | None = None
+    light: int | None = None
 
     def then(self, other: "Edit") -> "Edit":
         """This edit and another one after it, as one."""
@@ -62,6 +65,7 @@ class Edit:
             (red, green, blue),
             tuple(dict.fromkeys((*self.lifted_bones, *other.lifted_bones))),
             paint,
+            self.light if other.light is None else other.light,
         )
 
     def to(self, device: torch.device | str) -> "Edit":

@@ -84,5 +84,7 @@ def _shaded(
     normals = (weights[..., None] * state.anchor_normals[indices]).sum(1)
     albedo = avatar.albedo(neighbours, avatar.detail_near(state.posed.vertices, points, neighbours))
     traced = (weights[..., None] * state.light[indices]).sum(1)
-    light = avatar.illumination(state.posed.pose.rotations, neighbours, directed, normals, traced)
+    light = avatar.illumination(
+        state.posed.pose.rotations, neighbours, directed, normals, traced, avatar.light_of()
+    )
     return torch.cat([albedo, light[:, None], normals], dim=-1)

@@ -27,12 +27,15 @@ class Look:
         albedo_shift: added to the albedo, R,G,B in [-1, 1].
         lift_shadow: fingers or bones that cast no shadow, comma-separated.
         paint: a picture with transparency (PNG) in the rig's texture chart, laid on the skin.
+        light: of an avatar of several clips, the number of the one in whose light it is shown,
+            from 0; by default the first one's, or the one that was saved into the avatar.
     """
 
     light_gain: float = 1.0
     albedo_shift: str = "0,0,0"
     lift_shadow: str = ""
     paint: Path | None = None
+    light: int | None = None
 
     def check_look(self) -> None:
         """Refuses words that mean nothing, before anything is read.
@@ -47,11 +50,12 @@ class Look:
         """The edit of this avatar.
 
         Raises:
-            ValueError: what cannot be understood.
+            ValueError: what cannot be understood, or a light that the avatar does not have.
             CaptureError: if the picture of the paint cannot be read.
         """
+        avatar.light_of(Edit(light=self.light))
         paint = None if self.paint is None else paint_from(self.paint, avatar)
-        return Edit(self.light_gain, self._shift(), self._bones(), paint)
+        return Edit(self.light_gain, self._shift(), self._bones(), paint, self.light)
 
     def _shift(self) -> tuple[float, float, float]:
         try:

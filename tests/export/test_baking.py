@@ -175,3 +175,16 @@ def test_an_atlas_carries_the_same_colours_as_the_vertices(tmp_path: Path) -> No
     expected = avatar.albedo(anchors_near(avatar, hand, centres))
     # A texel off the middle of its face, where colours change from anchor to anchor.
     assert float((found - expected).abs().mean()) < 0.02
+
+
+def test_the_light_of_a_clip_is_baked_as_its_camera_saw_it(
+    two_lights: HandAvatar, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand = average_hand(two_lights)
+    first, second = (mean_light(two_lights, hand, Edit(light=light), 2) for light in (0, 1))
+    assert float((first.anchors - second.anchors).abs().mean()) > 0.05
+    # As an avatar of this light alone would be baked, in the view of this clip.
+    monkeypatch.setattr(two_lights, "edit", Edit(light=1))
+    monkeypatch.setattr(two_lights, "info", {"view": two_lights.info["views"][1]})
+    alone = mean_light(two_lights, hand, Edit(), 2)
+    assert torch.equal(alone.anchors, second.anchors)

@@ -234,3 +234,27 @@ def test_paint_is_laid_on_in_a_coat_of_its_own(small_avatar: HandAvatar) -> None
     )
     with torch.no_grad():
         assert painted.arrays()["paint"].values.shape == (len(painted.albedo), 4)
+
+
+def test_samples_are_in_the_light_that_is_asked_for(two_lights: HandAvatar) -> None:
+    def samples(light: int | None) -> FieldSamples:
+        generator = torch.Generator().manual_seed(5)
+        rotations = sampled_poses(two_lights, 1, generator, light)
+        return sample_field(two_lights, rotations, generator, num_points=64, light=light)
+
+    first, second = samples(None), samples(1)
+    assert not torch.equal(first.rotations[:, 0], second.rotations[:, 0])
+    assert torch.equal(first.rotations[:, 1:], second.rotations[:, 1:])
+    two_lights.edit = Edit(light=1)
+    try:
+        kept, other = samples(None), samples(0)
+    finally:
+        two_lights.edit = Edit()
+    assert torch.equal(kept.light, second.light) and torch.equal(other.light, first.light)
+    # The same places in the same poses: the lights alone differ.
+    turned = first.rotations[None, :1]
+    there = [
+        sample_field(two_lights, turned, torch.Generator().manual_seed(6), light=light).light
+        for light in (0, 1)
+    ]
+    assert float((there[0] - there[1]).abs().mean()) > 0.05

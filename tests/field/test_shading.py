@@ -130,3 +130,23 @@ def test_weights_of_before_there_was_a_reference_are_read() -> None:
     old = {k: v for k, v in field.state_dict().items() if k != "wrist_reference"}
     field.load_state_dict(old)
     assert torch.equal(field.wrist_reference, torch.zeros(3))
+
+
+def test_each_light_has_a_column_of_its_own_and_one_light_has_none() -> None:
+    torch.manual_seed(0)
+    one = IlluminationField(torch.rand(50, 3), PaperCues())
+    assert one.mlp.hidden[0].in_features == PaperCues.width
+    field = IlluminationField(torch.rand(50, 3), PaperCues(), num_lights=3)
+    cues = torch.zeros(NUM_BONES, 3), _neighbours(), torch.rand(6, NUM_BONES), torch.rand(6, 3)
+    assert field.mlp.hidden[0].in_features == PaperCues.width + 3
+    with torch.no_grad():
+        lights = [field(*cues, NO_LIGHT, which) for which in range(3)]
+        assert not torch.allclose(lights[0], lights[1])
+        assert torch.equal(field(*cues, NO_LIGHT), lights[0])
+        each = torch.tensor([0, 2, 1, 1, 0, 2])
+        mixed = field(*cues, NO_LIGHT, each)
+        torch.testing.assert_close(mixed, torch.stack(lights)[each, torch.arange(6)])
+        # A light is what its column says, and no other's.
+        field.mlp.hidden[0].weight[:, -2] += 0.5
+        assert torch.equal(field(*cues, NO_LIGHT, 0), lights[0])
+        assert not torch.allclose(field(*cues, NO_LIGHT, 1), lights[1])

@@ -36,7 +36,8 @@ def seen(avatar: HandAvatar, tiny_capture: Path) -> SeenSamples:
 
 
 def test_a_share_of_the_frames_comes_without_its_pose(seen: SeenSamples) -> None:
-    many = replace(seen, rotations=torch.ones(4000, 16, 3))
+    clips = torch.zeros(4000, dtype=torch.long)
+    many = replace(seen, rotations=torch.ones(4000, 16, 3), clips=clips)
     hidden = with_hidden_poses(many, 0.3, torch.Generator().manual_seed(1))
     is_zero = (hidden.rotations == 0).flatten(1)
     assert bool((is_zero.all(-1) == is_zero.any(-1)).all())

@@ -16,7 +16,7 @@ from handavatar.train.appearance import SeenSamples, find_seen_samples
 from handavatar.train.loop import METHODS, TrainOptions, train
 from handavatar.train.prior import load_prior
 from handavatar.train.runs import Checkpoint, load_checkpoint
-from handavatar.train.sky import bright_directions, fit_sky, place_directions, relit
+from handavatar.train.sky import _joined_skies, bright_directions, fit_sky, place_directions, relit
 
 
 def _seen_under(sky: torch.Tensor, tones: torch.Tensor) -> SeenSamples:
@@ -40,6 +40,7 @@ def _seen_under(sky: torch.Tensor, tones: torch.Tensor) -> SeenSamples:
         alpha=torch.ones(6000),
         points=torch.zeros(6000, 3),
         rotations=torch.zeros(1, 16, 3),
+        clips=torch.zeros(1, dtype=torch.long),
     )
 
 
@@ -50,6 +51,40 @@ def test_a_sky_is_found_from_shadows_whatever_the_tones() -> None:
     found = fit_sky(_seen_under(sky, tones), 30, seed=0)
     assert found.argsort(descending=True)[:2].tolist() == [7, 29]
     assert float(found[29] / found[7]) == pytest.approx(1 / 3, abs=0.15)
+
+
+def test_each_clip_has_a_sky_of_its_own_and_all_share_the_directions() -> None:
+    skies = torch.full((2, 40), 0.002)
+    skies[0, 7], skies[1, 29] = 0.6, 0.2
+    tones = 0.3 + 0.5 * torch.rand(30, generator=torch.Generator().manual_seed(1))
+    first, second = (_seen_under(sky, tones) for sky in skies)
+    both = replace(
+        first,
+        **{
+            name: torch.cat([getattr(first, name), getattr(second, name)])
+            for name in ("weights", "directed", "normals", "light", "colors", "alpha", "points")
+        },
+        neighbours=Neighbours(
+            torch.cat([first.neighbours.indices, second.neighbours.indices]),
+            torch.cat([first.neighbours.weights, second.neighbours.weights]),
+        ),
+        frames=torch.cat([first.frames, second.frames + 1]),
+        starts=torch.arange(12001),
+        rotations=torch.zeros(2, 16, 3),
+        clips=torch.tensor([0, 1]),
+    )
+    found = [fit_sky(both, 30, 0, clip) for clip in (0, 1)]
+    assert [int(sky.argmax()) for sky in found] == [7, 29]
+    # A clip alone is what it was, to the bit, and so are its directions.
+    assert torch.equal(found[0], fit_sky(first, 30, 0))
+    joined = _joined_skies(found)
+    assert torch.equal(_joined_skies(found[:1]), found[0])
+    chosen = bright_directions(even_directions(40), joined)
+    near = (chosen @ even_directions(40)[[7, 29]].T).amax(0)
+    assert bool((near > 0.98).all())
+    # However bright a clip is, it gets its share: here about half of what is not even.
+    count = [(chosen @ even_directions(40)[place] > 0.85).sum() for place in (7, 29)]
+    assert min(count) >= 6
 
 
 def test_directions_gather_where_the_sky_is_bright() -> None:

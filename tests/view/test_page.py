@@ -112,6 +112,24 @@ def test_light_and_skin_change_and_come_back(page: Any) -> None:
     assert page.input_value("#light") == "1"
 
 
+def test_an_avatar_of_several_clips_offers_their_lights_and_no_other_does(
+    page: Any, browser: Any, two_lights: HandAvatar, tmp_path: Path
+) -> None:
+    assert page.is_hidden("#lights")
+    with live_server(two_lights, tmp_path) as running, visit(browser) as context:
+        of_two = watched(context.new_page(), lambda url: url.startswith(own_addresses(running)))
+        of_two.goto(running.address)
+        of_two.select_option("#size", "64")
+        first = settled(of_two)
+        assert of_two.is_visible("#lights") and of_two.input_value("#clip") == "0"
+        of_two.select_option("#clip", "1")
+        second = settled(of_two)
+        assert (second != first).any()
+        of_two.click("#unedit")
+        assert (settled(of_two) == first).all() and of_two.input_value("#clip") == "0"
+        assert of_two.strays == []
+
+
 def test_dragging_turns_the_hand_and_the_wheel_zooms(page: Any) -> None:
     before = settled(page)
     box = page.locator("#picture").bounding_box()

@@ -33,6 +33,7 @@ WHOLE = {
         "albedo_shift": [0.1, 0, -0.1],
         "lift_shadow": ["thumb", "ring1"],
         "strokes": [{"anchor": 7, "radius": 5, "color": [1, 0, 0.5]}],
+        "light": 1,
     },
 }
 
@@ -46,7 +47,7 @@ def test_everything_that_a_page_says_is_in_the_scene() -> None:
         Orbit(right, math.radians(-30), 2.0, (0.5, -0.25)),
         "normal",
         384,
-        Touches(1.5, (0.1, 0.0, -0.1), (13, 14, 15, 10), (Stroke(7, 0.005, (1.0, 0.0, 0.5)),)),
+        Touches(1.5, (0.1, 0.0, -0.1), (13, 14, 15, 10), (Stroke(7, 0.005, (1.0, 0.0, 0.5)),), 1),
     )
 
 

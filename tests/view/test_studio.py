@@ -337,3 +337,38 @@ def test_nothing_is_left_where_saving_fails(
     with pytest.raises(OSError, match="No space"):
         Studio(small_avatar).save(Touches(), tmp_path)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_page_chooses_among_lights_and_each_has_its_own_view(
+    two_lights: HandAvatar, studio: Studio, tmp_path: Path
+) -> None:
+    of_two = Studio(two_lights, settings=FEW)
+    assert studio.about()["lights"] == 1 and of_two.about()["lights"] == 2
+    assert of_two.about()["touches"]["light"] == 0
+    scenes = [Scene(size=64, touches=Touches(light=light)) for light in (0, 1)]
+    shots = [of_two.shot(scene) for scene in scenes]
+    views = two_lights.info["views"]
+    for shot, view in zip(shots, views, strict=True):
+        placed = torch.tensor(view["camera_from_world"])
+        torch.testing.assert_close(shot.camera.camera_from_world, placed)
+        assert shot.pose.rotations[0].tolist() == view["rotations"][0]
+    assert torch.equal(shots[0].pose.rotations[1:], shots[1].pose.rotations[1:])
+    for shot, scene, light in zip(shots, scenes, (0, 1), strict=True):
+        edit = Edit(light=light)
+        expected = two_lights.render(shot.pose, shot.camera, edit, FEW)
+        expected_pixels = pass_pictures(expected)["illumination"]
+        lit = replace(scene, layer="illumination")
+        assert np.array_equal(of_two.refined(lit, "full", never), expected_pixels)
+        # The fluid picture is near it, and far from the other light's.
+        baked = of_two._baked.render(shot.pose, shot.camera, edit).illumination
+        other = of_two._baked.render(shot.pose, shot.camera, Edit(light=1 - light)).illumination
+        inside = (expected.alpha > 0.99) & (baked > 0)
+        far = (other - expected.illumination)[inside].abs().mean()
+        assert float((baked - expected.illumination)[inside].abs().mean()) < 0.3 * float(far)
+    turns = [of_two.shot(replace(scene, moment=Moment("turn", 3))).pose for scene in scenes]
+    assert not torch.equal(turns[0].rotations[0], turns[1].rotations[0])
+    saved = HandAvatar.load(of_two.save(Touches(light=1), tmp_path))
+    assert saved.edit == Edit(light=1)
+    assert Studio(saved, settings=FEW).about()["touches"]["light"] == 1
+    with pytest.raises(SceneError, match=r"light 5: .* choose from 0, 1"):
+        of_two.shot(Scene(touches=Touches(light=5)))

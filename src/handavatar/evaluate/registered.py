@@ -11,6 +11,7 @@ import torch
 from handavatar.avatar import HandAvatar, Rendering
 from handavatar.capture.frames import Frame
 from handavatar.capture.registration import observe_frame
+from handavatar.edit import Edit
 from handavatar.fit.energy import EnergyOptions
 from handavatar.fit.kinematics import NUM_UNKNOWNS
 from handavatar.fit.pictures import FramePicture
@@ -43,7 +44,7 @@ def registered_pose(
     """
     seen = observe_frame(frame)
     if rendering is None or rendering.alpha.shape != seen.picture.known.shape:
-        rendering = avatar.render(pose, seen.picture.camera)
+        rendering = avatar.render(pose, seen.picture.camera, Edit(light=frame.clip))
     start = pose.to("cpu")
     shown = FramePicture.of(
         seen.picture.camera,

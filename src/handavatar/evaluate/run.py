@@ -24,6 +24,7 @@ from handavatar.capture.frames import (
 )
 from handavatar.capture.registration import poses_of as registered_poses
 from handavatar.capture.registration import register_frames
+from handavatar.edit import Edit
 from handavatar.evaluate.baselines import judged_frame, textured_mesh_psnr, training_color
 from handavatar.evaluate.figures import protocol_figures
 from handavatar.evaluate.metrics import (
@@ -117,7 +118,8 @@ def evaluate_run(
 
     Raises:
         CheckpointError: if the run holds no finished avatar.
-        CaptureError: if the capture is damaged or the split is empty.
+        CaptureError: if the capture is damaged, the split is empty, or the avatar has no light of
+            one of the clips.
         FolderInUse: if ``out`` holds something that is no evaluation.
 
     Source: paper Sec. 4.1 (metrics).
@@ -129,6 +131,13 @@ def evaluate_run(
         raise CaptureError(
             f"{capture.folder}: no frame of split {options.split!r}",
             "name another split with --split",
+        )
+    clips = {capture.records[index].clip for index in indices}
+    if max(clips) >= avatar.num_lights:
+        raise CaptureError(
+            f"{capture.folder}: frames of clip {max(clips)} are to be judged; the avatar knows "
+            f"lights {', '.join(map(str, range(avatar.num_lights)))}",
+            "judge an avatar that was trained on these clips",
         )
     claim_folder(out, EVALUATION)
     frames = [capture.frame(index) for index in indices]
@@ -180,7 +189,8 @@ def _rendered(
         report(start / len(frames))
         part = slice(start, start + _AT_ONCE)
         cameras = [frame.camera for frame in frames[part]]
-        renderings += map(_on_cpu, avatar.render_batch(poses[part], cameras))
+        lights = [Edit(light=frame.clip) for frame in frames[part]]
+        renderings += map(_on_cpu, avatar.render_batch(poses[part], cameras, lights))
     judged = [
         judged_frame(frame, rendering.color, rendering.alpha)
         for frame, rendering in zip(frames, renderings, strict=True)

@@ -47,7 +47,7 @@ def unseen_pictures(avatar: HandAvatar, size: int) -> dict[str, UInt8[np.ndarray
         avatar: that knows what was seen.
         size: pixels along a side.
     """
-    pose = start_of(avatar.info.get("view"))
+    pose = start_of(avatar.view())
     camera = camera_on(avatar, [pose], size, _ROOM)
     middle = middle_of_hand(avatar.base_rig.to("cpu"), pose)
     template = avatar.rig.template_vertices

@@ -190,8 +190,8 @@ def mean_light(
         edit: on top of the avatar's own.
         count: poses.
     """
-    rig, start = avatar.base_rig, start_of(avatar.info.get("view"))
-    eye = _eye(avatar)
+    rig, start = avatar.base_rig, start_of(avatar.view(edit))
+    eye = _eye(avatar, edit)
     generator = torch.Generator().manual_seed(1)
     fingers = resolve_penetration(rig, sample_poses(rig, count, generator))
     turns = torch.zeros(count, 3)
@@ -229,9 +229,9 @@ def mean_light(
     return MeanLight(light, max(level, 1e-3), gain)
 
 
-def _eye(avatar: HandAvatar) -> Float[Tensor, "3"]:
+def _eye(avatar: HandAvatar, edit: Edit) -> Float[Tensor, "3"]:
     """Where the capture's camera stood, metres, world; over the back of the hand if unknown."""
-    view = avatar.info.get("view")
+    view = avatar.view(edit)
     if view is None:
         middle = middle_of_hand(avatar.base_rig, start_of(None))
         return middle + torch.tensor([0.0, 0.6, 0.0])

@@ -75,12 +75,18 @@ class FieldSamples:
 
 
 def sampled_poses(
-    avatar: HandAvatar, count: int, generator: torch.Generator
+    avatar: HandAvatar, count: int, generator: torch.Generator, light: int | None = None
 ) -> Float[Tensor, "count turns bones 3"]:
     """Poses as hands take them, each turned in the light in a few ways.
 
     Every other one is random, the others lie on the way from one gesture to another. The wrist is
     about where the capture had it, and sometimes anywhere.
+
+    Args:
+        avatar: whose joints and capture.
+        count: poses of the fingers.
+        generator: draws them.
+        light: of several clips, the one whose wrist it is; None as the avatar is shown.
     """
     rig = avatar.base_rig
     fingers = sample_poses(rig, count, generator)
@@ -97,7 +103,7 @@ def sampled_poses(
     axis = torch.nn.functional.normalize(torch.randn(total, 3, generator=generator), dim=-1)
     is_anywhere = (torch.arange(total) % _ANYWHERE == _ANYWHERE - 1)[:, None]
     away = matrix_from_axis_angle(torch.where(is_anywhere, angle * axis, near))
-    start = matrix_from_axis_angle(start_of(avatar.info.get("view")).rotations[0])
+    start = matrix_from_axis_angle(start_of(avatar.view(Edit(light=light))).rotations[0])
     wrists = axis_angle_from_matrix(start @ away).view(count, turns, 1, 3)
     return torch.cat([wrists, fingers[:, None, 1:].expand(-1, turns, -1, -1)], dim=2)
 
@@ -109,22 +115,24 @@ def sample_field(
     generator: torch.Generator,
     tell: Callable[[int], None] = lambda number: None,
     num_points: int = NUM_POINTS,
+    light: int | None = None,
 ) -> FieldSamples:
     """Looks up the fields on the hand in every pose.
 
     Args:
-        avatar: on the CPU; its own edit plays no part.
+        avatar: on the CPU; of its own edit only the light plays a part.
         rotations: of the poses; those in a row differ in the wrist alone, and what surrounds a
             place of the skin is looked up for all of them at once.
         generator: draws points and lifted fingers.
         tell: called with the number of every pose that is done.
         num_points: drawn per pose.
+        light: that shines, of several; None is the one in which the avatar is shown.
 
     Returns:
         All turns of the first pose, all of the second, and so on.
     """
     plain = copy.copy(avatar)
-    plain.edit = Edit()
+    plain.edit = Edit(light=avatar.light_of(Edit(light=light)))
     rows: list[tuple[Tensor, ...]] = []
     for number, turned in enumerate(rotations):
         rows += _in_pose(plain, turned, number, num_points, generator)
@@ -169,7 +177,14 @@ def _in_pose(
             if is_traced(avatar) and (lift or which > 0):
                 traced = avatar.prepare(HandPose(rotations, torch.zeros(3)), lift).light
             seen = Edit(lifted_bones=lift).of_directed(around)
-            light = avatar.illumination(rotations, near, seen, normals, near.interpolated(traced))
+            light = avatar.illumination(
+                rotations,
+                near,
+                seen,
+                normals,
+                near.interpolated(traced),
+                avatar.light_of(),
+            )
             lights.append(light)
         rows.append((rest, own.rest_joints, surface, points, lights[0], lifted, lights[-1]))
     return rows

@@ -143,7 +143,8 @@ def lightweight_hand(
 
     Args:
         avatar: on the CPU.
-        edit: its paint is laid on the avatar's own; all else of edits is for the page.
+        edit: its paint is laid on the avatar's own, and it chooses the light; all else of edits is
+            for the page.
         tell: hears what is being done.
         effort: poses and steps; by default what the avatar asks for.
     """
@@ -152,12 +153,13 @@ def lightweight_hand(
     base = avatar.base_rig
     levels = subdivision_levels(base.faces, base.num_vertices, avatar.rounds)
     generator = torch.Generator().manual_seed(3)
-    rotations = sampled_poses(avatar, effort.poses, generator)
+    rotations = sampled_poses(avatar, effort.poses, generator, edit.light)
     samples = sample_field(
         avatar,
         rotations,
         generator,
         lambda number: tell("fields", number + 1, effort.poses),
+        light=edit.light,
     )
     is_held_out = torch.arange(effort.poses) % _HELD_OUT == 0
     is_held_out = is_held_out.repeat_interleave(rotations.shape[1])

@@ -58,7 +58,7 @@ def skinned_mesh(
     joints = torch.where(skin.shares > 0, carriers[skin.bones], 0)
     turn = skeleton.file_from_rest[:3, :3].float()
     normals = vertex_normals(hand.rest_vertices, rig.faces)
-    clip = None if motion is None else _clip(avatar, hand, skeleton, motion)
+    clip = None if motion is None else _clip(avatar, hand, skeleton, motion, edit)
     mesh = SkinnedMesh(
         name="hand",
         vertices=(hand.rest_vertices @ turn.T)[seamed.sources],
@@ -101,7 +101,9 @@ def _mirrored_rigid(transforms: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*
     return flip[:, None] * transforms * flip
 
 
-def _clip(avatar: HandAvatar, hand: ShapedHand, skeleton: Skeleton, motion: Motion) -> Clip:
+def _clip(
+    avatar: HandAvatar, hand: ShapedHand, skeleton: Skeleton, motion: Motion, edit: Edit
+) -> Clip:
     """Joints follow their bones through a motion, float64."""
     joints = hand.rest_joints.double()
     world_from_bone = bone_transforms(motion.rotations.double(), joints)
@@ -111,7 +113,7 @@ def _clip(avatar: HandAvatar, hand: ShapedHand, skeleton: Skeleton, motion: Moti
     rest_from_joint = invert_rigid(skeleton.file_from_rest) @ skeleton.file_from_joint
     world_from_joint = world_from_rest[:, list(skeleton.bones)] @ rest_from_joint
     turn = skeleton.file_from_rest[:3, :3]
-    if (view := avatar.info.get("view")) is not None:
+    if (view := avatar.view(edit)) is not None:
         # From a camera that looks along +z with y down to one that looks along -z with y up.
         turn = torch.tensor(view["camera_from_world"], dtype=torch.float64)[:3, :3]
         turn = turn.new_tensor([1.0, -1.0, -1.0])[:, None] * turn

@@ -135,20 +135,20 @@ def _files(options: ExportOptions) -> list[Path]:
 
 
 def _glb(avatar: HandAvatar, edit: Edit, options: ExportOptions) -> bytes:
-    motion = _motion(avatar, options)
+    motion = _motion(avatar, edit, options)
     size = options.texture_size
     mesh = skinned_mesh(avatar, edit, options.bones, size, motion, options.unlit)
     return glb_bytes(mesh, f"handavatar {__version__}")
 
 
-def _motion(avatar: HandAvatar, options: ExportOptions) -> Motion | None:
+def _motion(avatar: HandAvatar, edit: Edit, options: ExportOptions) -> Motion | None:
     if options.motion is None:
         return None
-    return open_motion(options.motion, avatar.base_rig, start_of(avatar.info.get("view")))
+    return open_motion(options.motion, avatar.base_rig, start_of(avatar.view(edit)))
 
 
 def _write_web(avatar: HandAvatar, edit: Edit, options: ExportOptions, tell: Tell) -> None:
-    motion = _motion(avatar, options)
+    motion = _motion(avatar, edit, options)
     light = lightweight_hand(avatar, edit, tell)
     folder = UnfinishedFolder(options.out, WEB_PAGE, {"format": "web"}, _inputs(options))
     try:

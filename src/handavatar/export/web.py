@@ -92,13 +92,13 @@ def facts(
 ) -> dict[str, Any]:
     """What the page knows besides arrays; lengths in metres, angles of gestures in degrees."""
     info = avatar.info
-    start, side = start_of(info.get("view")), str(info.get("side", "right"))
+    start, side = start_of(avatar.view(edit)), str(info.get("side", "right"))
     joint = light.correctives.joints[0]
     known = {**GESTURES, **MORE_GESTURES}
     whole = avatar.edit.then(edit)
     skeleton = skeleton_of(light.hand, "webxr", side)
     turns = skeleton.file_from_joint[list(skeleton.carriers), :3, :3]
-    view = _camera(avatar, light, start)
+    view = _camera(avatar, light, start, edit)
     named = [str(info[name]) for name in ("subject", "method", "licence") if name in info]
     if avatar.base_rig.is_licensed:
         named.append("mesh and weights derive from a licensed rig")
@@ -136,7 +136,9 @@ def facts(
     }
 
 
-def _camera(avatar: HandAvatar, light: LightweightHand, start: HandPose) -> dict[str, Any]:
+def _camera(
+    avatar: HandAvatar, light: LightweightHand, start: HandPose, edit: Edit
+) -> dict[str, Any]:
     """Where the page's camera begins, with focal length and centre in sides of the picture."""
     poses = [start.rotations]
     for name in _HELD:
@@ -144,7 +146,7 @@ def _camera(avatar: HandAvatar, light: LightweightHand, start: HandPose) -> dict
         poses.append(torch.cat([start.rotations[:1], fingers]))
     held = light.hand.posed(HandPose(torch.stack(poses), start.translation.expand(len(poses), 3)))
     middle = middle_of_hand(avatar.base_rig, start)
-    camera = camera_holding(avatar.info.get("view"), held.vertices.flatten(0, 1), middle, 1)
+    camera = camera_holding(avatar.view(edit), held.vertices.flatten(0, 1), middle, 1)
     pose = camera.camera_from_world
     return {
         "turn": pose[:3, :3].flatten().tolist(),

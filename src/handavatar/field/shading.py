@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from handavatar.field.anchors import Neighbours
@@ -172,18 +172,24 @@ class IlluminationField(nn.Module):
     """How much light arrives: a scalar from pose, place and directed soft occupancy.
 
     Source: paper Sec. 3.3 (illumination field); MLP 4 x 256.
+    Departs: the paper knows one light. Recordings of one hand that were made under different ones
+        share its albedo; here the network is told which recording's light it is, by a column for
+        each. With one light there is no column.
     """
 
     position_codes: Tensor
     directions: Tensor
     wrist_reference: Tensor
 
-    def __init__(self, anchor_positions: Float[Tensor, "anchors 3"], chosen: CueSet) -> None:
+    def __init__(
+        self, anchor_positions: Float[Tensor, "anchors 3"], chosen: CueSet, num_lights: int = 1
+    ) -> None:
         """Fixes the encodings E of the anchors' template positions (metres).
 
         Args:
             anchor_positions: on the template.
             chosen: which cues the network sees.
+            num_lights: under which the hand was recorded.
         """
         super().__init__()
         centred = (anchor_positions - anchor_positions.mean(0)) / POSITION_SCALE
@@ -191,7 +197,9 @@ class IlluminationField(nn.Module):
         self.register_buffer("directions", torch.zeros(chosen.num_directions, 3))
         self.register_buffer("wrist_reference", torch.zeros(3))
         self.chosen = chosen
-        self.mlp = MLP(chosen.width, chosen.hidden[0], len(chosen.hidden), 1)
+        self.num_lights = num_lights
+        columns = num_lights if num_lights > 1 else 0
+        self.mlp = MLP(chosen.width + columns, chosen.hidden[0], len(chosen.hidden), 1)
 
     def _load_from_state_dict(
         self, state_dict: dict[str, Any], prefix: str, *others: Any, **more: Any
@@ -207,6 +215,7 @@ class IlluminationField(nn.Module):
         directed: Float[Tensor, "queries bones"],
         normals: Float[Tensor, "queries 3"],
         light: Float[Tensor, "queries directions"],
+        which: Int[Tensor, "queries"] | int = 0,
     ) -> Float[Tensor, "queries"]:
         """Illumination, in (0, 1).
 
@@ -217,6 +226,8 @@ class IlluminationField(nn.Module):
             directed: directed soft occupancy at the queries, without gradient.
             normals: world normals at the queries.
             light: what lights in ``directions`` bring; no columns where the cues know none.
+            which: of the lights that the field knows, by number; one for all queries or one for
+                each.
 
         Departs: the authors give the wrist's rotation in camera axes, which cannot tell where a
             light that is fixed in the world stands; here it is the world's. Of the two vectors
@@ -229,4 +240,8 @@ class IlluminationField(nn.Module):
         pose = torch.cat([wrist, rotations[..., 1:, :]], dim=-2)
         pose = pose.flatten(-2).expand(len(places), -1)
         inputs = self.chosen(Cues(pose, places, directed, normals.detach(), light.detach()))
+        if self.num_lights > 1:
+            numbers = torch.arange(self.num_lights, device=inputs.device)
+            is_lit = numbers == (which if isinstance(which, int) else which[:, None])
+            inputs = torch.cat([inputs, is_lit.to(inputs).expand(len(inputs), -1)], dim=-1)
         return self.mlp(inputs)[:, 0].sigmoid()

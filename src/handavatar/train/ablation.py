@@ -376,6 +376,7 @@ def _samples_along(
         alpha=alpha[:, 0],
         points=places / alpha.clamp_min(1e-6),
         rotations=state.posed.pose.rotations[None],
+        clips=found.rays.new_zeros(1),
     )
     return _Along(seen, found.depths)
 

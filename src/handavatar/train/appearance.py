@@ -35,6 +35,7 @@ class SeenSamples:
         alpha: how much of each pixel the hand covers.
         points: mean place of each pixel's samples, metres, world.
         rotations: pose of each frame, axis-angle.
+        clips: of each frame, the number of the recording that it comes from: of its light.
     """
 
     weights: Float[Tensor, "samples"]
@@ -48,6 +49,7 @@ class SeenSamples:
     alpha: Float[Tensor, "pixels"]
     points: Float[Tensor, "pixels 3"]
     rotations: Float[Tensor, "frames bones 3"]
+    clips: Int[Tensor, "frames"]
 
 
 @torch.no_grad()
@@ -99,6 +101,7 @@ def find_seen_samples(
         torch.cat(alphas),
         torch.cat(points),
         torch.stack([frame.pose.rotations for frame in frames]).to(avatar.device),
+        torch.tensor([frame.clip for frame in frames], device=avatar.device),
     )
 
 
@@ -131,12 +134,14 @@ def appearance_loss(
     sample, ray = chosen_samples(seen, pixels)
     neighbours = Neighbours(seen.neighbours.indices[sample], seen.neighbours.weights[sample])
     albedo = avatar.albedo(neighbours)
+    frames = seen.frames[sample]
     light = avatar.illumination(
-        seen.rotations[seen.frames[sample]],
+        seen.rotations[frames],
         neighbours,
         seen.directed[sample],
         seen.normals[sample],
         seen.light[sample].float(),
+        seen.clips[frames],
     )
     color = composite_sparse(seen.weights[sample], ray, albedo * light[:, None], len(pixels))
     color = color / seen.alpha[pixels][:, None]

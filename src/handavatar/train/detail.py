@@ -142,6 +142,7 @@ def light_of_pixels(avatar: HandAvatar, seen: SeenSamples) -> Float[Tensor, "pix
             seen.directed[part],
             seen.normals[part],
             seen.light[part].float(),
+            seen.clips[seen.frames[part]],
         )
         total.index_add_(0, ray[part], seen.weights[part] * light)
     return total / seen.alpha

@@ -14,6 +14,7 @@ from torch import Tensor
 from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar, RenderSettings, chosen_device
 from handavatar.capture.frames import FITTED_SIDE, Capture, CaptureError, Frame, read_capture
 from handavatar.capture.view import view_of
+from handavatar.edit import Edit
 from handavatar.evaluate.metrics import mean_color
 from handavatar.evaluate.perceptual import PerceptualChoice, PerceptualLoss, perceptual_loss
 from handavatar.field.shading import CueSet, OrientedCues, PaperCues, TracedCues
@@ -287,7 +288,10 @@ def train(options: TrainOptions) -> Path:
     frames = training_frames(capture, method)
     perceptual = perceptual_loss(options.perceptual).to(device)
     training = begin_training(capture, frames, method, options)
-    training.avatar.info["view"] = view_of(frames)
+    views = [view_of(own) for own in frames_of_clips(capture, frames)]
+    training.avatar.info["view"] = views[0]
+    if len(views) > 1:
+        training.avatar.info["views"] = views
     run = _open_or_create(options, capture, perceptual.name, steps)
     live = shown_live(run, training.avatar, training.corrections, frames)
     with locked(run), stop_signals() as stopped, live, _repeatable(device):
@@ -332,6 +336,27 @@ def training_frames(capture: Capture, method: Method) -> list[Frame]:
     if method.picture_size is None:
         return list(frames)
     return [frame.binned(method.picture_size) for frame in frames]
+
+
+def frames_of_clips(capture: Capture, frames: list[Frame]) -> list[list[Frame]]:
+    """The training frames of each clip.
+
+    Args:
+        capture: of the frames.
+        frames: of training.
+
+    Raises:
+        CaptureError: if a clip has none: its light could not be learned.
+    """
+    clips = [[frame for frame in frames if frame.clip == clip] for clip in range(capture.num_clips)]
+    for clip, own in enumerate(clips):
+        if not own:
+            raise CaptureError(
+                f"{capture.folder}: clip {clip} has no frame of split 'train', from which its "
+                "light could be learned",
+                "mark some of its frames as split: train, and number the clips from 0 without gaps",
+            )
+    return clips
 
 
 def _learn_detail(
@@ -435,6 +460,7 @@ def begin_training(
         method.num_anchors,
         cues=method.cues,
         info=info,
+        num_lights=capture.num_clips,
     )
     load_prior(avatar.occupancy, options.prior)
     avatar.start_from_color(
@@ -684,7 +710,7 @@ def frame_losses(
     x, y = torch.cat([*patches, border]).unbind(-1)
     near = avatar.near_mesh(state, camera, settings.mask_margin)[y, x].nonzero()[:, 0]
     rays = rays_through_pixels(camera, pixel_centers(camera)[y, x][near])
-    seen = avatar.render_rays(state, rays, settings, generator)
+    seen = avatar.render_rays(state, rays, settings, generator, Edit(light=frame.clip))
     black = torch.zeros(len(x), device=device)
     alpha = black.index_copy(0, near, seen.alpha)
     color = black[:, None].repeat(1, 3).index_copy(0, near, seen.color)

@@ -2,7 +2,8 @@
 
 Sharp shadows come from a small part of the sky. Directions spread evenly are 20 degrees apart, and
 a shadow that is cast from the wrong one of two lies millimetres off. So a first, rough sky is
-fitted to the training pictures, and most directions are placed where it is bright.
+fitted to the training pictures, and most directions are placed where it is bright. Where there are
+several clips, each has a sky of its own, and they share the directions.
 """
 
 from dataclasses import replace
@@ -43,16 +44,26 @@ def place_directions(
         The same samples with the light from the new directions.
     """
     directions = avatar.illumination.directions
-    brightness = fit_sky(seen, len(avatar.anchor_corners), seed)
-    directions.copy_(bright_directions(directions, brightness))
+    skies = [
+        fit_sky(seen, len(avatar.anchor_corners), seed, clip) for clip in range(avatar.num_lights)
+    ]
+    directions.copy_(bright_directions(directions, _joined_skies(skies)))
     return relit(avatar, frames, seen)
 
 
 @torch.enable_grad()
-def fit_sky(seen: SeenSamples, num_anchors: int, seed: int) -> Float[Tensor, "directions"]:
-    """Brightness of a sky that, with a grey tone per anchor, explains the training pictures.
+def fit_sky(
+    seen: SeenSamples, num_anchors: int, seed: int, clip: int = 0
+) -> Float[Tensor, "directions"]:
+    """Brightness of a sky that, with a grey tone per anchor, explains a clip's training pictures.
 
     Light adds up, stored colours are a power of it; the exponent is fitted as well.
+
+    Args:
+        seen: of the training frames.
+        num_anchors: of the avatar.
+        seed: of the pixels that are looked at.
+        clip: whose pictures.
     """
     device = seen.weights.device
     sky = torch.full((seen.light.shape[1],), -3.0, device=device, requires_grad=True)
@@ -62,8 +73,9 @@ def fit_sky(seen: SeenSamples, num_anchors: int, seed: int) -> Float[Tensor, "di
     optimizer = torch.optim.Adam([sky, ambient, exponent, tones], lr=_RATE)
     generator = torch.Generator().manual_seed(seed)
     grey = seen.colors.mean(-1)
+    own = (seen.clips[seen.frames[seen.starts[:-1]]] == clip).nonzero()[:, 0]
     for _ in range(_STEPS):
-        pixels = torch.randint(len(grey), (_PIXELS,), generator=generator).to(device)
+        pixels = own[torch.randint(len(own), (_PIXELS,), generator=generator).to(device)]
         sample, ray = chosen_samples(seen, pixels)
         neighbours = Neighbours(seen.neighbours.indices[sample], seen.neighbours.weights[sample])
         arriving = seen.light[sample].float() @ nn.functional.softplus(sky)
@@ -75,6 +87,13 @@ def fit_sky(seen: SeenSamples, num_anchors: int, seed: int) -> Float[Tensor, "di
         loss.backward()
         optimizer.step()
     return nn.functional.softplus(sky.detach())
+
+
+def _joined_skies(skies: list[Float[Tensor, "directions"]]) -> Float[Tensor, "directions"]:
+    """Of several clips, as if their lights shone together, each as brightly as any other."""
+    if len(skies) == 1:
+        return skies[0]
+    return torch.stack([sky / sky.sum() for sky in skies]).sum(0)
 
 
 def bright_directions(

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar, Rendering
+from handavatar.capture.view import start_of
 from handavatar.edit import Edit
 from handavatar.field.anchors import nearest_anchors
 from handavatar.field.shape import personal_hand
@@ -43,7 +44,8 @@ class BakedPose:
         normals: of its own vertices, unit, world.
         lit_normals: of the lit anchors, unit, world.
         surroundings: soft occupancy of every part at the lit anchors.
-        lights: at the vertices, by which bones are lifted; filled as pictures need it.
+        lights: at the vertices, by which light shines and which bones are lifted; filled as
+            pictures need it.
     """
 
     posed: PosedHand
@@ -51,7 +53,7 @@ class BakedPose:
     normals: Float[Tensor, "vertices 3"]
     lit_normals: Float[Tensor, "lit 3"]
     surroundings: Float[Tensor, "lit bones"]
-    lights: dict[tuple[int, ...], Float[Tensor, "vertices"]]
+    lights: dict[tuple[int, tuple[int, ...]], Float[Tensor, "vertices"]]
 
 
 class BakedAvatar:
@@ -66,7 +68,8 @@ class BakedAvatar:
 
         Args:
             avatar: read only, its own edit included, which is applied.
-            first: a pose of it; traced light keeps the shadows of this one.
+            first: a pose of it; traced light keeps the shadows of this one. Another clip's light
+                keeps those of the typical view of that clip.
         """
         self._avatar = avatar
         self._first = first.to(avatar.device)
@@ -88,7 +91,7 @@ class BakedAvatar:
         base = avatar.base_rig
         self._levels = subdivision_levels(base.faces, base.num_vertices, avatar.rounds)
         self._poses: OrderedDict[bytes, BakedPose] = OrderedDict()
-        self._visible: OrderedDict[tuple[int, ...], Tensor] = OrderedDict()
+        self._visible: OrderedDict[tuple[int, tuple[int, ...]], Tensor] = OrderedDict()
 
     @torch.no_grad()
     def render(self, pose: HandPose, camera: Camera, edit: Edit) -> Rendering:
@@ -183,32 +186,39 @@ class BakedAvatar:
 
     def _light(self, baked: BakedPose, edit: Edit) -> Float[Tensor, "vertices"]:
         """The illumination at the vertices, before its gain."""
-        if edit.lifted_bones not in baked.lights:
+        key = (self._avatar.light_of(edit), edit.lifted_bones)
+        if key not in baked.lights:
             field = self._avatar.illumination
             traced = baked.lit_normals @ field.directions.T
             if traced.shape[1]:
-                traced = traced.clamp_min(0) * self._visibility(edit.lifted_bones)
+                traced = traced.clamp_min(0) * self._visibility(*key)
             light = field(
                 baked.posed.pose.rotations,
                 self._at_lit,
                 edit.of_directed(baked.surroundings),
                 baked.lit_normals,
                 traced,
+                key[0],
             )
-            baked.lights[edit.lifted_bones] = self._from_lit.interpolated(light[:, None])[:, 0]
-        return baked.lights[edit.lifted_bones]
+            baked.lights[key] = self._from_lit.interpolated(light[:, None])[:, 0]
+        return baked.lights[key]
 
-    def _visibility(self, lifted: tuple[int, ...]) -> Float[Tensor, "lit directions"]:
+    def _visibility(self, light: int, lifted: tuple[int, ...]) -> Float[Tensor, "lit directions"]:
         """Which share of a light in each direction reaches each lit anchor, in the first pose."""
-        if lifted not in self._visible:
-            state = self._avatar.prepare(self._first, lifted)
+        key = (light, lifted)
+        if key not in self._visible:
+            first = self._first
+            if light != self._avatar.light_of():
+                view = self._avatar.view(Edit(light=light))
+                first = start_of(view).to(self._avatar.device)
+            state = self._avatar.prepare(first, lifted)
             every = len(state.anchors) // len(self._lit.faces)
             cosine = state.anchor_normals[::every] @ self._avatar.illumination.directions.T
             share = (state.light[::every] / cosine.clamp_min(1e-3)).clamp(0, 1)
-            self._visible[lifted] = torch.where(cosine > 0, share, 1.0)
+            self._visible[key] = torch.where(cosine > 0, share, 1.0)
             while len(self._visible) > _KEPT:
                 self._visible.popitem(last=False)
-        return self._visible[lifted]
+        return self._visible[key]
 
 
 def dabbed(

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from handavatar.capture.frames import MAX_CLIPS
 from handavatar.edit import bones_named
 from handavatar.hand.pose import FINGER_BONES, NUM_BONES
 
@@ -93,12 +94,14 @@ class Touches:
         albedo_shift: added to the albedo, RGB in [-1, 1].
         lifted_bones: bones that cast no shadow.
         strokes: dabs and pictures, over what paint the avatar has, later ones on top.
+        light: of an avatar of several clips, the number of the one in whose light it is shown.
     """
 
     light_gain: float = 1.0
     albedo_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     lifted_bones: tuple[int, ...] = ()
     strokes: tuple[Stroke | Coat, ...] = ()
+    light: int = 0
 
 
 @dataclass(frozen=True)
@@ -218,7 +221,8 @@ def read_touches(content: Any) -> Touches:
     Raises:
         SceneError: what is wrong with them.
     """
-    given = fields(content, "touches", ("light_gain", "albedo_shift", "lift_shadow", "strokes"))
+    known = ("light_gain", "albedo_shift", "lift_shadow", "strokes", "light")
+    given = fields(content, "touches", known)
     names = _list(given.get("lift_shadow", []), "lift_shadow", NUM_BONES)
     if not all(isinstance(name, str) for name in names):
         raise SceneError("lift_shadow: expected names of fingers or bones")
@@ -232,6 +236,7 @@ def read_touches(content: Any) -> Touches:
         _triple(given.get("albedo_shift", [0, 0, 0]), "albedo_shift", -1.0, 1.0),
         bones,
         tuple(_stroke(stroke) for stroke in strokes),
+        whole(given.get("light", 0), "light", 0, MAX_CLIPS - 1),
     )
 
 

@@ -119,13 +119,15 @@ class Studio:
         self.side = str(avatar.info.get("side", "right"))
         # The rest hand and its joints answer small questions, on the CPU and from any thread.
         self._rig = avatar.base_rig.to("cpu")
-        self._first = start_of(avatar.info.get("view"))
+        # Of each light: a clip has a world of its own.
+        self._firsts = _first_poses(avatar)
         self._motions = dict(motions or {})
-        self._frames: dict[tuple[str | None, int], tuple[Camera, Tensor]] = {}
+        self._built_in: dict[tuple[str, int], Motion] = {}
+        self._frames: dict[tuple[str | None, int, int], tuple[Camera, Tensor]] = {}
         self._making_motions = threading.Lock()
         self._mixing_paint = threading.Lock()
         # A module of its own: the other one's evaluations can be interrupted.
-        self._baked = BakedAvatar(copy.deepcopy(self._avatar), self._first)
+        self._baked = BakedAvatar(copy.deepcopy(self._avatar), self._firsts[0])
         self._places, self._normals = self._baked.template_anchors()
         self._paints: OrderedDict[tuple[Any, ...], Paint | None] = OrderedDict()
         self._coats: OrderedDict[str, Paint] = OrderedDict()
@@ -146,12 +148,14 @@ class Studio:
             "fingers": list(FINGER_BONES),
             "angles": self.angles(None),
             "gestures": {name: self._degrees(gesture(self._rig, name)) for name in known},
+            "lights": self._avatar.num_lights,
             "motions": [*self._motions, *(name for name in MOTIONS if name not in self._motions)],
             "touches": {
                 "light_gain": self.start.light_gain,
                 "albedo_shift": list(self.start.albedo_shift),
                 "lift_shadow": [BONE_NAMES[bone] for bone in sorted(lifted)],
                 "strokes": [],
+                "light": self.start.light or 0,
             },
             "finger_bones": {
                 finger: [BONE_NAMES[bone] for bone in bones]
@@ -159,19 +163,25 @@ class Studio:
             },
         }
 
-    def motion(self, name: str) -> Motion:
+    def motion(self, name: str, light: int = 0) -> Motion:
         """A motion by name; built-in ones are made when they are first asked for.
+
+        Args:
+            name: of the motion.
+            light: in whose clip's view a built-in one begins.
 
         Raises:
             SceneError: if there is none.
         """
-        if name not in self._motions:
-            if name not in MOTIONS:
-                raise SceneError(f"there is no motion {ascii(name)[:40]}")
-            with self._making_motions:
-                if name not in self._motions:
-                    self._motions[name] = named_motion(self._rig, name, self._first)
-        return self._motions[name]
+        if name in self._motions:
+            return self._motions[name]
+        if name not in MOTIONS:
+            raise SceneError(f"there is no motion {ascii(name)[:40]}")
+        with self._making_motions:
+            if (name, light) not in self._built_in:
+                made = named_motion(self._rig, name, self._firsts[light])
+                self._built_in[name, light] = made
+        return self._built_in[name, light]
 
     def angles(self, moment: Moment | None) -> list[list[float]]:
         """Flexion, abduction and twist of every bone at a moment, degrees; the wrist's are zero.
@@ -201,7 +211,7 @@ class Studio:
         Raises:
             SceneError: if there is no such moment.
         """
-        pose = self._at(scene.moment)
+        pose = self._at(scene.moment, self._light(scene.touches))
         if scene.angles is not None:
             rotations = rotations_from_angles(self._rig, torch.tensor(scene.angles))
             pose = replace(pose, rotations=torch.cat([pose.rotations[:1], rotations[1:]]))
@@ -216,11 +226,23 @@ class Studio:
         """The edit that a page's touches make of the untouched avatar.
 
         Raises:
-            SceneError: if a stroke lies on an anchor, or is a picture, that there is not.
+            SceneError: if a stroke lies on an anchor, or is a picture, that there is not, or the
+                avatar has no such light.
         """
+        light = self._light(touches)
         return Edit(
-            touches.light_gain, touches.albedo_shift, touches.lifted_bones, self._paint(touches)
+            touches.light_gain,
+            touches.albedo_shift,
+            touches.lifted_bones,
+            self._paint(touches),
+            light if self._avatar.num_lights > 1 else None,
         )
+
+    def _light(self, touches: Touches) -> int:
+        try:
+            return self._avatar.light_of(Edit(light=touches.light))
+        except ValueError as error:
+            raise SceneError(str(error)) from error
 
     def fluid(self, scene: Scene) -> Pixels:
         """The picture for a hand in motion, of at most ``FLUID_SIZE`` pixels.
@@ -315,31 +337,33 @@ class Studio:
             aside.unlink(missing_ok=True)
         raise SceneError(f"{folder} holds {MOST_SAVED} edited avatars: move some away")
 
-    def _at(self, moment: Moment | None) -> HandPose:
+    def _at(self, moment: Moment | None, light: int = 0) -> HandPose:
         if moment is None:
-            return self._first
-        motion = self.motion(moment.motion)
+            return self._firsts[light]
+        motion = self.motion(moment.motion, light)
         if moment.step >= len(motion):
             raise SceneError(f"{moment.motion} has {len(motion)} steps, no step {moment.step}")
         return motion.pose(moment.step)
 
     def _camera(self, scene: Scene) -> Camera:
-        key = (None if scene.moment is None else scene.moment.motion, scene.size)
+        light = self._light(scene.touches)
+        key = (None if scene.moment is None else scene.moment.motion, light, scene.size)
         if key not in self._frames:
-            poses = self._framed(key[0])
+            poses = self._framed(key[0], light)
             middle = middle_of_hand(self._rig, poses[0])
-            self._frames[key] = camera_on(self._avatar, poses, scene.size), middle
+            camera = camera_on(self._avatar, poses, scene.size, edit=Edit(light=light))
+            self._frames[key] = camera, middle
         return orbiting(*self._frames[key], scene.orbit, self.side == "left")
 
-    def _framed(self, name: str | None) -> list[HandPose]:
+    def _framed(self, name: str | None, light: int) -> list[HandPose]:
         if name is not None:
-            motion = self.motion(name)
+            motion = self.motion(name, light)
             return [motion.pose(step) for step in range(len(motion))]
-        poses = [self._first]
+        first = self._firsts[light]
+        poses = [first]
         for shape in ("spread", "flat", "fist"):
             fingers = gesture(self._rig, shape)[1:]
-            rotations = torch.cat([self._first.rotations[:1], fingers])
-            poses.append(replace(self._first, rotations=rotations))
+            poses.append(replace(first, rotations=torch.cat([first.rotations[:1], fingers])))
         return poses
 
     def _paint(self, touches: Touches) -> Paint | None:
@@ -375,6 +399,13 @@ class Studio:
         angles = angles_from_rotations(self._rig, rotations).rad2deg()
         angles[0] = 0
         return [[round(value, 3) for value in row] for row in angles.tolist()]
+
+
+def _first_poses(avatar: HandAvatar) -> list[HandPose]:
+    """Of each light: the wrist as its clip saw it, the fingers as the first clip did."""
+    poses = [start_of(avatar.view(Edit(light=light))) for light in range(avatar.num_lights)]
+    fingers = poses[0].rotations[1:]
+    return [replace(pose, rotations=torch.cat([pose.rotations[:1], fingers])) for pose in poses]
 
 
 def orbiting(

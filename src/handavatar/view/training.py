@@ -80,7 +80,7 @@ class _Seen:
     @cached_property
     def baked(self) -> BakedAvatar:
         """For one thread."""
-        return BakedAvatar(self.twin, start_of(self.twin.info.get("view")))
+        return BakedAvatar(self.twin, start_of(self.twin.view()))
 
 
 class Watch:
@@ -239,7 +239,7 @@ class Watch:
             pose = HandPose(rotations[view.frame], translations[view.frame])
         left, top, side = _square(frame)
         camera = frame.camera.cropped(left, top, side, side)
-        return Shot(pose, camera.resized(view.size, view.size), Edit())
+        return Shot(pose, camera.resized(view.size, view.size), Edit(light=frame.clip))
 
     def _frame(self, number: int) -> Frame:
         capture = self._capture

@@ -187,7 +187,8 @@ async function paintPicture() {
 }
 
 function showTouches() {
-  const { light_gain: gain, albedo_shift: shift, lift_shadow: lifted } = scene.touches;
+  const { light_gain: gain, albedo_shift: shift, lift_shadow: lifted, light: clip } = scene.touches;
+  $("clip").value = clip;
   setRange($("light"), gain);
   ["red", "green", "blue"].forEach((name, at) => setRange($(name), shift[at]));
   for (const tick of document.querySelectorAll("#shadows input")) {
@@ -365,6 +366,10 @@ function wire() {
   $("gesture").append(new Option("choose", ""), ...Object.keys(about.gestures).map((name) => new Option(name.replaceAll("_", " "), name)));
   $("motion").append(...about.motions.map((name) => new Option(name, name)));
 
+  $("lights").hidden = about.lights < 2;
+  $("clip").append(...Array.from({ length: about.lights }, (_, clip) => new Option(`clip ${clip}`, clip)));
+
+  on("clip", "change", () => { scene.touches.light = Number($("clip").value); changed(); });
   on("size", "change", () => { scene.size = Number($("size").value); changed(); });
   on("home", "click", () => { home(); changed(); });
   on("light", "input", () => { scene.touches.light_gain = Number($("light").value); changed(); });
