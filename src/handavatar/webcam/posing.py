@@ -136,6 +136,14 @@ class PoseFollower:
         self._last, self._time = pose, time
         return LivePose(self.hand, pose, camera, misfit)
 
+    def landmarks(self, live: LivePose) -> Float[Tensor, "21 2"]:
+        """Where landmarks of a fitted hand are, pixels of its camera."""
+        return project(live.camera, self._places(live.pose)[:NUM_LANDMARKS])[0]
+
+    def _places(self, pose: HandPose) -> Float[Tensor, "points 3"]:
+        still = self.hand.rest_joints.new_zeros(*self.hand.rest_joints.shape, 0)
+        return Skeleton.of(self.hand, pose, still).positions(self._rest)
+
     def _camera(self, size: tuple[int, int]) -> Camera:
         focal = self._focal_share * max(size)
         return Camera((focal, focal), (size[0] / 2, size[1] / 2), *size, torch.eye(4))
@@ -245,9 +253,7 @@ class PoseFollower:
         return pose, energy
 
     def _misfit(self, pose: HandPose, camera: Camera, seen: "_Observed") -> float:
-        still = self.hand.rest_joints.new_zeros(*self.hand.rest_joints.shape, 0)
-        points = Skeleton.of(self.hand, pose, still).positions(self._rest)
-        apart = (project(camera, points)[0] - seen.places)[:NUM_LANDMARKS]
+        apart = (project(camera, self._places(pose))[0] - seen.places)[:NUM_LANDMARKS]
         return float(apart.norm(dim=-1).mean()) / (seen.scale * HAND_SIZE)
 
 
