@@ -173,7 +173,9 @@ class OwnFinder:
             return None
         return first, second
 
-    def _searched(self, image: UInt8[np.ndarray, "height width 3"]) -> list[tuple[SeenCrop, SeenCrop]]:
+    def _searched(
+        self, image: UInt8[np.ndarray, "height width 3"]
+    ) -> list[tuple[SeenCrop, SeenCrop]]:
         looks = looks_all_over(image.shape[1], image.shape[0])
         seen = ask_looks(self._tracker, image, looks)
         sides = sorted({look.side for look in looks})
@@ -303,9 +305,7 @@ def _is_large(seen: SeenCrop, image: UInt8[np.ndarray, "height width 3"]) -> boo
     return seen.extent >= _SMALLEST * min(image.shape[:2])
 
 
-def looks_all_over(
-    width: int, height: int, sizes: Sequence[float] = SEARCHED_SIZES
-) -> list[Look]:
+def looks_all_over(width: int, height: int, sizes: Sequence[float] = SEARCHED_SIZES) -> list[Look]:
     """Crops of every size that overlap by half.
 
     Args:

@@ -305,15 +305,7 @@ def capture_video(
     report = progress or (lambda share, doing: None)
     options.sampling()  # Refuses what selects nothing, before any work.
     rig = rig or load_rig(options.rig)
-    header = {
-        "rig_name": rig.name,
-        "rig_sha256": rig.sha256,
-        "subject": options.subject,
-        "source": options.file.name,
-        "licence": options.licence,
-        "overwrite": options.overwrite,
-        "inputs": (options.file, *files_named(options.rig)),
-    }
+    header = _header(options, rig)
     CaptureWriter(options.out, **header)  # type: ignore[arg-type]  # refuses a folder in use now
     try:
         track = track or track_video(
@@ -351,6 +343,31 @@ def capture_video(
         contact_sheet(_tiles(track, results)).save(writer.file("overview.png"))
     report(1.0, "done")
     return read_capture(options.out)
+
+
+def refuse_capture_in_use(options: VideoOptions) -> None:
+    """Refuses what :func:`capture_video` would refuse, before there is a video.
+
+    Raises:
+        CaptureError: the folder is in use.
+        RigError: there is no such rig.
+        ValueError: no picture would be selected.
+    """
+    options.sampling()
+    CaptureWriter(options.out, **_header(options, load_rig(options.rig)))  # type: ignore[arg-type]
+
+
+def _header(options: VideoOptions, rig: Rig) -> dict[str, object]:
+    """What a capture says of itself, and what it may not be written over."""
+    return {
+        "rig_name": rig.name,
+        "rig_sha256": rig.sha256,
+        "subject": options.subject,
+        "source": options.file.name,
+        "licence": options.licence,
+        "overwrite": options.overwrite,
+        "inputs": (options.file, *files_named(options.rig)),
+    }
 
 
 def track_video(options: VideoOptions, progress: Callable[[int, str], None] | None = None) -> Track:

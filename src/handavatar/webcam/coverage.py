@@ -148,15 +148,19 @@ class SkinCoverage:
         area = self._area[vertices]
         return float((area * self.is_seen[vertices]).sum() / area.sum())
 
-    def picture(self) -> UInt8[np.ndarray, "height width 3"]:
-        """The flat hand from its four sides, seen skin green; palm, back, and the two edges."""
+    def picture(self, is_left: bool = False) -> UInt8[np.ndarray, "height width 3"]:
+        """The spread hand's palm, back and two edges in a row; skin that was seen is green.
+
+        Args:
+            is_left: whether it is shown as a left hand.
+        """
         seen = (self.counts.float() / _ENOUGH).clamp(max=1.0)[:, None]
         colors = torch.lerp(torch.tensor(_UNSEEN), torch.tensor(_SEEN), seen)
         pieces = []
         for fragments, shade in _drawings(self._rig):
             drawn = interpolate(fragments, self._rig.faces, colors * shade[:, None])
             drawn[~fragments.mask] = torch.tensor(_GROUND)
-            pieces.append(drawn)
+            pieces.append(drawn.flip(1) if is_left else drawn)
         row = torch.cat(pieces, dim=1)
         return (255 * row).round().byte().numpy()
 

@@ -83,6 +83,7 @@ class HandFollower:
         self._votes = 0.0
         self._pictures = 0
         self._motion = np.zeros(2)
+        self._has_turned = False
 
     def see(self, image: UInt8[np.ndarray, "height width 3"]) -> FollowedHand | None:
         """The hand in the next picture; None where there is none.
@@ -96,14 +97,18 @@ class HandFollower:
             is_new = True
         else:
             seen = self._follow(image, look)
-            is_new = False
+            is_new, self._has_turned = self._has_turned, False
         if seen is None:
             self._look = None
             return None
-        if self._side == "auto" and seen.look.is_mirrored != (self._votes < 0):
-            if abs(self._votes) > _CHANGED:
-                seen = replace(seen, look=replace(seen.look, is_mirrored=self._votes < 0))
-                is_new = True
+        is_left = self._votes < 0
+        is_sure = self._side == "auto" and abs(self._votes) > _CHANGED
+        if is_sure and seen.look.is_mirrored != is_left:
+            # Its points are those of the other side: that look comes with the next picture.
+            self._look = replace(seen.again(), is_mirrored=is_left)
+            self._motion = np.zeros(2)
+            self._has_turned = True
+            return None
         again = seen.again()
         self._motion = np.zeros(2) if look is None else np.subtract(again.middle, look.middle)
         self._look = again

@@ -223,9 +223,7 @@ class PoseFollower:
         information = sigmas**-2
 
         def linearised(pose: HandPose) -> tuple[Tensor, Tensor, float]:
-            seen = linearise_landmarks(
-                self._rest, self.hand, pose, camera, landmarks, self._energy
-            )
+            seen = linearise_landmarks(self._rest, self.hand, pose, camera, landmarks, self._energy)
             residuals, jacobian = habit_residuals(self.hand.rig, pose.rotations[None])
             slopes = torch.nn.functional.pad(jacobian[0], (0, 3))
             away = pose_difference(start, pose)

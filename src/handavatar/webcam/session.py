@@ -127,9 +127,7 @@ class LiveSession:
             followed, live, landmarks, pixels[dots.numpy()], are_seen, warnings, is_counted
         )
 
-    def _facing(
-        self, live: LivePose, vertices: Float[Tensor, "vertices 3"]
-    ) -> Int[Tensor, "dots"]:
+    def _facing(self, live: LivePose, vertices: Float[Tensor, "vertices 3"]) -> Int[Tensor, "dots"]:
         """Some of the vertices that the camera would see."""
         towards = torch.nn.functional.normalize(-vertices, dim=-1)
         normals = vertex_normals(vertices, live.hand.rig.faces)
