@@ -2,6 +2,7 @@
 
 import base64
 import io
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -31,6 +32,11 @@ _MOST_WAITING = 4
 """Pictures that wait for their turn; more are asked to try again."""
 _FORGOTTEN = 3.0
 """Seconds without a picture after which another page may have the camera."""
+_LOW_PRIORITY = 10
+"""Of what sees pictures while a recording may be made: a browser that has to wait drops pictures of
+it. A priority is a thread's own on Linux."""
+_EVERY = 0.1
+"""Seconds from one picture to the next, at least, where none has to be drawn."""
 _NOTHING = "there is no such thing"
 
 
@@ -58,6 +64,7 @@ class WebcamAnswers:
         self._longest = longest
         self._seeing, self._drawing = threading.Lock(), threading.Lock()
         self._writing = threading.Lock()
+        self._priorities = threading.local()
         self._places = threading.BoundedSemaphore(_MOST_WAITING)
         self._owner, self._last, self._order = "", -np.inf, -1
         self._is_left = False
@@ -118,7 +125,10 @@ class WebcamAnswers:
         raise Refused(404, _NOTHING)
 
     def close(self) -> None:
-        """Removes a recording that is not whole."""
+        """Ends what is going on, and removes a recording that is not whole."""
+        # A thread that computes while the program ends would take it down.
+        for _ in range(_MOST_WAITING):
+            self._places.acquire()
         if self._recording is not None:
             with self._writing:
                 self._recording.abandon()
@@ -133,6 +143,7 @@ class WebcamAnswers:
             "longest": self._longest,
             # One is seen while the other is drawn.
             "at_once": 1 if self._avatar is None else 2,
+            "every": _EVERY if self._avatar is None else 0.0,
         }
 
     def _look(self, body: bytes, query: dict[str, str]) -> Answer:
@@ -142,6 +153,7 @@ class WebcamAnswers:
         if not self._places.acquire(blocking=False):
             raise Busy
         try:
+            self._step_back()
             image = read_picture(body)
             with self._seeing:
                 self._own(client)
@@ -164,6 +176,12 @@ class WebcamAnswers:
             return json_answer(answer)
         finally:
             self._places.release()
+
+    def _step_back(self) -> None:
+        """Leaves the cores to the browser, once in a connection's thread."""
+        if self._recording is not None and not hasattr(self._priorities, "is_low"):
+            self._priorities.is_low = True
+            os.nice(_LOW_PRIORITY)
 
     def _own(self, client: str) -> None:
         """Gives the camera to a page, unless another one has it."""

@@ -122,6 +122,7 @@ async function follow() {
       $("problem").dataset.from = "look";
       await sleep(1000);
     }
+    await sleep(1000 * about.every - (performance.now() - begin));
   }
 }
 
@@ -133,7 +134,7 @@ async function show(seen, begin) {
   const rate = times.length > 1 ? 1000 * (times.length - 1) / (times.at(-1) - times[0]) : 0;
   const parts = [seen.side ? `${seen.side} hand` : "no hand", `${rate.toFixed(1)} pictures a second`, `${Math.round(performance.now() - begin)} ms behind`];
   $("state").textContent = parts.join("   ");
-  Object.assign($("state").dataset, { order: seen.order, rate: rate.toFixed(2), side: seen.side ?? "" });
+  Object.assign($("state").dataset, { order: seen.order, rate: rate.toFixed(2), side: seen.side ?? "", server: JSON.stringify(seen.milliseconds) });
   $("instruction").textContent = seen.instruction;
   $("warnings").replaceChildren(...seen.warnings.map((warning) => {
     const line = document.createElement("li");
