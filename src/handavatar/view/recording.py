@@ -72,6 +72,8 @@ class RecordingFile:
     def finish(self, size: int) -> Path:
         """Puts the video at its place, under a name that is free; no file is replaced.
 
+        If that cannot be, what was sent is gone.
+
         Args:
             size: of the whole, bytes.
 
@@ -81,9 +83,9 @@ class RecordingFile:
         aside = self._aside
         if aside is None:
             raise SceneError("no recording was begun")
-        if size != self._size or not size:
-            raise SceneError(f"bytes: {self._size} have come, {size} were sent: record it again")
         try:
+            if size != self._size or not size:
+                raise SceneError(f"bytes: {self._size} have come of {size}: record it again")
             with aside.open("rb") as file:
                 os.fsync(file.fileno())
             for number in range(1, MOST_NAMES):

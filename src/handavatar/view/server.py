@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 
@@ -137,6 +137,7 @@ class ViewServer:
         _end(self.turns, self.films)
 
 
+@runtime_checkable
 class PageServer(Protocol):
     """What serves a page."""
 

@@ -28,6 +28,8 @@ _BEYOND, _NEAR_BORDER = 0.02, 0.005
 # Of the hand's pixels by brightness, 0 to 255: nine tenths of them are darker than this, or more
 # than this share has a channel at its end.
 _DARK, _FULL, _MOST_FULL = 60.0, 250, 0.25
+# Of a whole picture's brightness: below, a camera sees noise rather than skin.
+_DARK_PICTURE = 30.0
 # Share of the picture's slopes that another blur takes away: less, and it was blurred before.
 _SHARP = 0.25
 # Pixels along the longer side of the hand at which blur is judged, at most.
@@ -91,6 +93,12 @@ def find_warnings(
     if is_unsure:
         found.append("unsure")
     return [Warning(kind) for kind in found]
+
+
+def warnings_without_hand(image: UInt8[np.ndarray, "height width 3"]) -> list[Warning]:
+    """What is wrong with a picture in which no hand is seen."""
+    is_dark = float(image.mean()) < _DARK_PICTURE
+    return [Warning("none"), *([Warning("dark")] if is_dark else [])]
 
 
 def hand_pixels(

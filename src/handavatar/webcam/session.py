@@ -15,7 +15,7 @@ from handavatar.jobs.threads import one_thread
 from handavatar.webcam.coverage import FINISHED, SkinCoverage, next_step
 from handavatar.webcam.following import FollowedHand, HandFollower, WhichSide
 from handavatar.webcam.posing import LivePose, PoseFollower, mirrored_places
-from handavatar.webcam.quality import ADVICE, Warning, find_warnings
+from handavatar.webcam.quality import ADVICE, Warning, find_warnings, warnings_without_hand
 
 _UNSURE = 0.12
 """Mean distance of fitted and seen landmarks in hand sizes from which on the pose is not believed;
@@ -109,7 +109,8 @@ class LiveSession:
         followed = self._follower.see(image)
         if followed is None:
             nowhere = np.zeros((0, 2))
-            return self._view(None, None, nowhere, nowhere, [], [Warning("none")], False)
+            warnings = warnings_without_hand(image)
+            return self._view(None, None, nowhere, nowhere, [], warnings, False)
         live = self._poser.see(followed, (width, height), time)
         vertices = live.hand.posed(live.pose).vertices
         pixels = project(live.camera, vertices)[0].double().numpy()
