@@ -58,6 +58,23 @@ def seen(page: Any, count: int) -> None:
     )
 
 
+def test_without_a_camera_or_leave_the_page_says_what_to_do(tmp_path: Path) -> None:
+    """Before the other tests: Playwright runs one browser at a time."""
+    session = LiveSession(load_rig("open-hand").shaped())
+    answers = WebcamAnswers(session, None, RecordingFile(tmp_path / "mine"), 60.0)
+    with serving(WebcamServer(answers, guard_of("127.0.0.1", ""), 0)) as server:
+        for arguments, why in (
+            ((), "no camera|may not use the camera"),
+            ((FAKE_CAMERA[0], "--deny-permission-prompts"), "may not use the camera"),
+        ):
+            with launched(*arguments) as browser, visit(browser) as context:
+                page = opened(context, server.address)
+                page.wait_for_function(
+                    "why => new RegExp(why).test($('problem').textContent)", arg=why
+                )
+                assert page.is_visible("#again") and page.is_disabled("#record")
+
+
 def test_the_hand_is_marked_and_the_avatar_follows(camera: Any, small_avatar: HandAvatar) -> None:
     driven = DrivenAvatar(small_avatar)
     answers = WebcamAnswers(LiveSession(driven.hand), driven, None, 60.0)
@@ -100,22 +117,6 @@ def test_a_recording_that_is_thrown_away_leaves_nothing(camera: Any, tmp_path: P
         page.click("#drop")
         page.wait_for_function("() => $('record').textContent === 'record' && recorder === null")
         assert list(tmp_path.iterdir()) == [] and page.is_hidden("#problem")
-
-
-def test_without_a_camera_or_leave_the_page_says_what_to_do(tmp_path: Path) -> None:
-    session = LiveSession(load_rig("open-hand").shaped())
-    answers = WebcamAnswers(session, None, RecordingFile(tmp_path / "mine"), 60.0)
-    with serving(WebcamServer(answers, guard_of("127.0.0.1", ""), 0)) as server:
-        for arguments, why in (
-            ((), "no camera|may not use the camera"),
-            ((FAKE_CAMERA[0], "--deny-permission-prompts"), "may not use the camera"),
-        ):
-            with launched(*arguments) as browser, visit(browser) as context:
-                page = opened(context, server.address)
-                page.wait_for_function(
-                    "why => new RegExp(why).test($('problem').textContent)", arg=why
-                )
-                assert page.is_visible("#again") and page.is_disabled("#record")
 
 
 def test_the_whole_way_from_the_page_to_a_capture(camera: Any, tmp_path: Path) -> None:

@@ -21,6 +21,8 @@ from handavatar.webcam.posing import LivePose
 
 LONGER_SIDE = 320
 """Pixels of the picture along its longer side."""
+_LIT_EVERY = 4
+"""Pictures from one new light to the next: half of a picture's time would go into it."""
 
 
 class DrivenAvatar:
@@ -37,6 +39,8 @@ class DrivenAvatar:
         self._camera_from_world = (
             torch.eye(4) if view is None else torch.tensor(view["camera_from_world"])
         )
+        self._lit: HandPose | None = None
+        self._pictures = 0
         self.hand: ShapedHand = avatar.base_rig.to("cpu").shaped(avatar.coefficients.cpu())
 
     @one_thread()
@@ -57,7 +61,11 @@ class DrivenAvatar:
         # Light belongs to the world of the avatar's capture: the camera stands where it stood.
         pose = pose_in_world(live.pose, self.hand.rest_joints[0], self._camera_from_world)
         camera = replace(camera, camera_from_world=self._camera_from_world)
-        pixels = eight_bits(self._baked.render(pose, camera, Edit()).color.cpu()).numpy()
+        if self._lit is None or self._pictures % _LIT_EVERY == 0:
+            self._lit = pose
+        self._pictures += 1
+        rendering = self._baked.render(pose, camera, Edit(), self._lit)
+        pixels = eight_bits(rendering.color.cpu()).numpy()
         return np.ascontiguousarray(pixels[:, ::-1]) if is_left else pixels
 
 

@@ -43,7 +43,7 @@ from handavatar.jobs.threads import one_thread
 from handavatar.tracker.points import TrackedPoints
 from handavatar.webcam.following import FollowedHand
 
-_STEPS, _STEPS_AT_FIRST = 2, 8
+_STEPS, _STEPS_AT_FIRST = 1, 8
 _BEGINNINGS = ("relaxed", "spread", "fist")
 """Gestures from which a pose of which nothing is known is begun; the best end counts."""
 _DAMPING, _FURTHER, _BACK = 1e-2, 0.25, 6.0
