@@ -27,7 +27,7 @@ MOST_CAMERA_BYTES = 1 << 20
 MOST_PIECE_BYTES = 4 << 20
 """Of a piece of a recording."""
 MOST_CONNECTIONS = 160
-MOST_PICTURES = 4
+MOST_PICTURES = 2
 """Pictures that are being received or read at a time; more are asked to try again."""
 MOST_PORTS = 20
 """Ports that are tried, from the one that is asked for."""

@@ -21,6 +21,8 @@ from handavatar.view.server import address_of, checked_guard, greet, serving, st
 from handavatar.view.webcam_answers import WebcamAnswers
 from handavatar.webcam.session import LiveSession
 
+_MOST_POSTED = 4
+"""Pictures and pieces of a recording that are received at a time; more are asked to try again."""
 _LAST_ANSWER = 0.5
 """Seconds in which the page still gets the answer that all is whole."""
 
@@ -71,6 +73,8 @@ class WebcamServer:
         self.guard = replace(guard, cookie=f"{guard.cookie}-{self.port}")
         self._http.guard = self.guard
         self._http.answers = answers
+        # Two pictures on their way, a piece of a recording, and what another page may try.
+        self._http.pictures = threading.BoundedSemaphore(_MOST_POSTED)
 
     @property
     def address(self) -> str:
@@ -127,7 +131,7 @@ def record_webcam(options: WebcamOptions) -> Path | None:
         while not is_stopped() and answers.recorded is None:
             time.sleep(0.1)
         if answers.recorded is not None:
-            threading.Event().wait(_LAST_ANSWER)
+            time.sleep(_LAST_ANSWER)
     if answers.recorded is None and options.out is not None:
         raise KeyboardInterrupt("nothing was recorded, nothing was written")
     return answers.recorded
