@@ -74,7 +74,7 @@ AT_LEAST = {
     "webcam.session": "LiveSession LiveSession.see LiveView",
     "webcam.following": "HandFollower FollowedHand",
     "webcam.posing": "LivePose PoseFollower",
-    "webcam.coverage": "SkinCoverage STEPS next_step",
+    "webcam.coverage": "SkinCoverage next_step",
     "retouch": "Look EditOptions save_edited paint_from",
     "doctor": "Finding examine",
     "cli": "main",

@@ -20,6 +20,7 @@ let stream = null;
 let order = 0;                // of the newest picture that was sent
 let shown = 0;                // of the newest answer that was drawn
 let isOver = false;           // the recording is whole: nothing more is sent
+const ending = new AbortController();
 let frame = 0;                // number of the camera's newest picture
 const times = [];             // of the last answers
 let recorder = null;
@@ -28,7 +29,7 @@ const small = document.createElement("canvas");
 const sleep = (milliseconds) => new Promise((wake) => setTimeout(wake, milliseconds));
 
 async function ask(path, options) {
-  const answer = await fetch(path, options);
+  const answer = await fetch(path, { ...options, signal: ending.signal });
   if (answer.ok) return answer;
   let why = answer.statusText;
   try { why = (await answer.json()).error; } catch { /* the status says enough */ }
@@ -263,6 +264,7 @@ async function finish(job) {
     } else {
       const { path } = await (await postJson("recording/end", { bytes: job.size })).json();
       isOver = true;
+      ending.abort();
       for (const track of stream.getTracks()) track.stop();
       $("instruction").textContent = "Recorded. The capture is being made: the terminal says how far it is. This page may be closed.";
       $("warnings").replaceChildren();
