@@ -28,6 +28,7 @@ from handavatar.hand.rigs import load_rig
 from handavatar.synthetic.films import FilmOptions, make_film
 from handavatar.synthetic.truth import FilmTruth, read_film_truth
 from handavatar.tracker.model import shipped_tracker
+from handavatar.tracker.network import INPUT_SIDE
 from handavatar.view.driven import DrivenAvatar
 from handavatar.view.studio import encoded
 from handavatar.view.webcam_answers import read_picture
@@ -118,6 +119,11 @@ with ThreadPoolExecutor(1) as pool:
         waiting.result()
 seconds = time.perf_counter() - begin
 print(f"{path}: {len(frames)} pictures, {count / seconds:.1f} a second")
+look = np.zeros((1, INPUT_SIDE, INPUT_SIDE, 3), dtype=np.uint8)
+looking: list[tuple[float, float]] = []
+for _ in range(20):
+    timed(looking, lambda: shipped_tracker().tell(look))
+told("for comparison, one look by the network", looking)
 told("reading a picture", reading)
 told("seeing it: hand, pose, warnings, coverage", seeing)
 if drawing:

@@ -110,7 +110,7 @@ def post(server: WebcamServer, path: str, **content: Any) -> tuple[int, Any]:
 def test_a_posted_picture_is_answered_with_the_hand(
     server: WebcamServer, hand_film: FilmTruth, hand_pictures: list[np.ndarray]
 ) -> None:
-    for order in range(8):
+    for order in range(0, 24, 2):
         status, told = look(server, hand_pictures[0], order)
         assert status == 200
     tracked = shipped_tracker().points.positions(hand_film.rest_hand, hand_film.pose(0))
@@ -120,7 +120,7 @@ def test_a_posted_picture_is_answered_with_the_hand(
     assert np.linalg.norm(apart, axis=-1).mean() < 0.06 * hand_film.camera.height
     assert told["side"] == "right" and told["warnings"] == [] and told["avatar"] is None
     assert told["steps"]["palm"] == 1 and "back" in told["instruction"]
-    status, dark = look(server, (hand_pictures[0] * 0.2).astype(np.uint8), 8)
+    status, dark = look(server, (hand_pictures[0] * 0.2).astype(np.uint8), 24)
     assert [warning["kind"] for warning in dark["warnings"]] == ["dark"]
     assert "light" in dark["warnings"][0]["remedy"]
     status, data = send(server.port, "/map", None)

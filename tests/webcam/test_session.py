@@ -19,13 +19,13 @@ def session(**options: str) -> LiveSession:
 
 
 def settled(images: list[np.ndarray], live: LiveSession | None = None) -> list[LiveView]:
-    """What is told of pictures a tenth of a second apart, once the hand was found in the first."""
+    """What is told of pictures a fifth of a second apart, once the hand was found in the first."""
     live = live or session()
     for number in range(20):
         if live.see(images[0], number / 100).followed is not None:
             break
     live.coverage.reset()
-    return [live.see(image, 1 + number / 10) for number, image in enumerate(images)]
+    return [live.see(image, 1 + number / 5) for number, image in enumerate(images)]
 
 
 def kinds(views: list[LiveView]) -> list[set[str]]:
@@ -154,7 +154,7 @@ def test_pictures_may_change_their_size_and_time_may_stand_still(
     settled(hand_pictures[:2], live)
     half = np.asarray(Image.fromarray(hand_pictures[2]).reduce(2))
     for _ in range(4):
-        view = live.see(half, 1.1)
+        view = live.see(half, 1.2)
         assert view.live is None or bool(torch.isfinite(view.live.pose.rotations).all())
 
 

@@ -219,7 +219,10 @@ class PoseFollower:
         landmarks: LandmarkSightings,
         steps: int,
     ) -> tuple[HandPose, float]:
-        """A pose near another, as the sigmas say, and its energy."""
+        """A pose near another, as the sigmas say, and the energy before the last step.
+
+        The last step is taken as it is: what it did shows in the next picture.
+        """
         information = sigmas**-2
 
         def linearised(pose: HandPose) -> tuple[Tensor, Tensor, float]:
@@ -237,18 +240,20 @@ class PoseFollower:
 
         pose, damping = start, _DAMPING
         hessian, gradient, energy = linearised(pose)
-        for _ in range(steps):
+        for step in range(steps):
             damped = hessian + damping * torch.diag(hessian.diagonal())
             change = -torch.linalg.solve(damped, gradient)
             change = change * min(1.0, _LONGEST_TURN / max(float(change[:-3].abs().max()), 1e-9))
             candidate = moved_pose(pose, change)
+            if step == steps - 1:
+                return candidate, energy
             found = linearised(candidate)
             if found[2] < energy:
                 pose, damping = candidate, damping * _FURTHER
                 hessian, gradient, energy = found
             else:
                 damping *= _BACK
-        return pose, energy
+        raise AssertionError("at least one step is taken")
 
     def _misfit(self, pose: HandPose, camera: Camera, seen: "_Observed") -> float:
         apart = (project(camera, self._places(pose))[0] - seen.places)[:NUM_LANDMARKS]

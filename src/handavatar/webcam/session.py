@@ -20,6 +20,9 @@ from handavatar.webcam.quality import ADVICE, Warning, find_warnings, warnings_w
 _UNSURE = 0.12
 """Mean distance of fitted and seen landmarks in hand sizes from which on the pose is not believed;
 measured on made films it is 0.01 to 0.07."""
+_COUNT_EVERY = 0.15
+"""Seconds from one picture that counts for the skin to the next, at least: neighbours see
+the same."""
 _EVERY_DOT = 5
 """Of the vertices that face the camera, so manyth are shown."""
 
@@ -90,6 +93,7 @@ class LiveSession:
         self._follower = follower or HandFollower(side)
         self._poser = PoseFollower(hand, self._follower.tracker.points, focal_share)
         self.coverage = SkinCoverage(hand.rig)
+        self._counted = -_COUNT_EVERY
 
     @property
     def rig(self) -> Rig:
@@ -120,8 +124,9 @@ class LiveSession:
         is_unsure = live.misfit > _UNSURE
         warnings = find_warnings(image, followed.seen, pixels, is_unsure)
         is_counted = not {w.kind for w in warnings} & {"dark", "blur", "unsure", "small"}
-        if is_counted:
+        if is_counted and abs(time - self._counted) >= _COUNT_EVERY:
             self.coverage.add(live, vertices)
+            self._counted = time
         dots = self._facing(live, vertices)
         are_seen = self.coverage.is_seen[dots].tolist()
         return self._view(
