@@ -19,6 +19,7 @@ COMMANDS: dict[str, Command] = {
     "demo": default.demo,
     "doctor": default.doctor,
     "capture video": capture.video,
+    "capture webcam": capture.webcam,
     "capture synth": capture.synth,
     "capture benchmark": capture.benchmark,
     "capture degrade": capture.degrade,
