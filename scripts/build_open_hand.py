@@ -810,6 +810,9 @@ others, who released the base mesh and its targets as CC0 in September 2020.
 
 No part of MANO, SMPL or any of their data went into these files.
 
+`capture/motion_files/soma.py`, which reads and writes SOMA-X's files, holds where the knuckles of SOMA-X's hand lie
+from its wrist and how its metacarpals are turned: 45 numbers of `data/soma/soma_rig.pt`, under the same licence (Apache 2.0).
+
 `skin_full_2.safetensors` and `skin_778_2.safetensors` hold refined skinning weights of these two meshes
 after two midpoint subdivisions, made from them alone by `handavatar rig refine --level full` and
 `--level 778`. They derive from the same weights and stand under the same licence as those (Apache 2.0).

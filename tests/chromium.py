@@ -20,10 +20,14 @@ _ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swifts
 
 
 @contextmanager
-def launched() -> Iterator[Any]:
-    """The browser, as long as the block lasts; the fixture ``browser`` is one for a module."""
+def launched(*arguments: str) -> Iterator[Any]:
+    """The browser, as long as the block lasts; the fixture ``browser`` is one for a module.
+
+    Args:
+        arguments: of its command line, besides those that all tests need.
+    """
     with playwright.sync_playwright() as manager:
-        running = manager.chromium.launch(executable_path=CHROMIUM, args=_ARGUMENTS)
+        running = manager.chromium.launch(executable_path=CHROMIUM, args=[*_ARGUMENTS, *arguments])
         yield running
         running.close()
 

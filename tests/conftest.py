@@ -10,10 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
 from handavatar.avatar import HandAvatar
+from handavatar.capture.decoding import Sampling, video_frames
 from handavatar.capture.frames import Frame, write_capture
 from handavatar.capture.view import view_of
 from handavatar.field.shading import OrientedCues
@@ -161,6 +163,30 @@ def film_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def small_film(film_folder: Path) -> FilmTruth:
     """Its truth."""
     return read_film_truth(film_folder / "small.mp4")
+
+
+@pytest.fixture(scope="session")
+def hand_film_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A made film of five pictures, large enough for a webcam's page; read only."""
+    options = FilmOptions(
+        "hand", 21, 0.2, ("spread", "relaxed"), width=320, height=240, seconds=0.5, fps=10.0
+    )
+    folder = tmp_path_factory.mktemp("hand_film")
+    return make_film(replace(options, distance=0.36, crf=12), folder)
+
+
+@pytest.fixture(scope="session")
+def hand_film(hand_film_path: Path) -> FilmTruth:
+    """Its truth."""
+    return read_film_truth(hand_film_path)
+
+
+@pytest.fixture(scope="session")
+def hand_pictures(hand_film_path: Path) -> list[np.ndarray]:
+    """Its pictures; read only."""
+    frames = list(video_frames(hand_film_path, Sampling(10.0), lambda told: None))
+    assert len(frames) == 5
+    return [frame.image for frame in frames]
 
 
 def avatar_of_the_prior() -> HandAvatar:

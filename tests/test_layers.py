@@ -8,7 +8,7 @@ from source_tree import imported_modules, modules
 # Left: a folder or top module. Right: what it may import besides itself.
 EVERYTHING_BELOW = (
     "geometry jobs hand fit capture field render edit replay avatar plain retouch processes "
-    "alignment animate evaluate train peers export view demo doctor synthetic bench tracker"
+    "alignment animate evaluate train peers export view webcam demo doctor synthetic bench tracker"
 )
 MAY_IMPORT = {
     name: set(allowed.split())
@@ -24,6 +24,8 @@ MAY_IMPORT = {
         # The network that sees hands; knows pictures, not videos.
         "tracker": "geometry jobs hand",
         "capture": "geometry jobs hand render fit tracker",
+        # A hand before a camera, followed live; knows neither avatars nor pages.
+        "webcam": "geometry jobs hand render fit capture tracker",
         "field": "geometry jobs hand",
         "edit": "hand field",
         # A function's work on a GPU, recorded.
@@ -53,7 +55,8 @@ MAY_IMPORT = {
         "export": "geometry hand capture field render edit avatar retouch jobs",
         # Its fluid pictures bake the fields on the mesh; its others are what `animate` makes. What
         # a trainer leaves for others to see is read where it is written.
-        "view": "geometry jobs hand capture field render edit avatar retouch animate train",
+        "view": "geometry jobs hand capture field render edit avatar retouch animate train webcam "
+        "tracker",
         # What words and pictures mean to an avatar.
         "retouch": "hand capture edit avatar",
         "processes": "",

@@ -28,7 +28,7 @@ EXACTLY = {
         "FINGERTIPS LICENCE LeftShape ManoModel Side WHERE_TO_GET_IT absolute_rotations "
         "growth_agreement read_mano"
     ),
-    "hand.rigs": "SCHEMA find_rig load_rig read_rig rigs_folder save_rig",
+    "hand.rigs": "SCHEMA find_rig load_mano load_rig read_rig rigs_folder save_rig",
     "hand.detail": "refined subdivided",
     "edit": "Edit Paint bones_named",
     "avatar": (
@@ -52,6 +52,8 @@ AT_LEAST = {
         "Motion Motion.pose gesture middle_of_hand named_motion open_motion read_motion "
         "write_motion"
     ),
+    "capture.motion_import": "MotionFromOptions motion_from",
+    "capture.motion_export": "MotionToOptions motion_to",
     "capture.view": "start_of",
     "capture.video": "VideoOptions capture_video",
     "capture.synthetic": "SynthOptions make_capture",
@@ -61,6 +63,7 @@ AT_LEAST = {
         "angles_from_rotations clamped_angles interpolate_rotations "
         "resolve_penetration rotations_from_angles"
     ),
+    "hand.retargeting": "rest_frames retarget",
     "hand.skin_refinement": "RefinementOptions SkinRefinement refine_skin",
     "hand.sparse_skin": "SparseSkin SparseSkin.load SparseSkin.save",
     "geometry.meshes": "SurfacePoints SurfacePoints.positions",
@@ -70,6 +73,11 @@ AT_LEAST = {
     "export.rigged": "skinned_mesh mirrored",
     "export.gltf": "Clip SkinnedMesh glb_bytes",
     "view.server": "ViewOptions view",
+    "view.webcam": "WebcamOptions record_webcam",
+    "webcam.session": "LiveSession LiveSession.see LiveView",
+    "webcam.following": "HandFollower FollowedHand",
+    "webcam.posing": "LivePose PoseFollower",
+    "webcam.coverage": "SkinCoverage next_step",
     "retouch": "Look EditOptions save_edited paint_from",
     "doctor": "Finding examine",
     "cli": "main",

@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 from handavatar.hand.mano import ManoModel, read_mano
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.rig import LicensedRigMissing, RigError
-from handavatar.hand.rigs import find_rig, load_rig, read_rig, rigs_folder, save_rig
+from handavatar.hand.rigs import find_rig, load_mano, load_rig, read_rig, rigs_folder, save_rig
 
 
 @pytest.fixture
@@ -124,3 +124,21 @@ def test_damaged_files_are_refused(model: ManoModel, tmp_path: Path, damage: str
         save_file(tensors, path, {"made_by": "somebody else"})
     with pytest.raises(RigError, match=r"rig\.safetensors"):
         read_rig(path)
+
+
+def test_mean_pose_and_components_come_back_with_an_imported_rig(
+    home: Path, tmp_path: Path
+) -> None:
+    """From the file itself, from the imported rig by its name, and from wherever it was put."""
+    file = write_mano(tmp_path / "MANO_LEFT.pkl", "left")
+    model = read_mano(file)
+    save_rig(model)
+    elsewhere = save_rig(model, tmp_path / "mine.safetensors")
+    for reference in (str(file), "mano-left", str(elsewhere)):
+        found = load_mano(reference)
+        assert (found.side, found.left_shape, found.sha256) == ("left", "mirrored", model.sha256)
+        assert torch.equal(found.hands_mean, model.hands_mean)
+        assert torch.equal(found.hands_components, model.hands_components)
+        assert found.rig.sha256 == model.rig.sha256
+    with pytest.raises(LicensedRigMissing, match="rig mano-right: not imported"):
+        load_mano("mano-right")

@@ -75,7 +75,7 @@ def _skin_colors(
     found = []
     for frame in frames[::every]:
         vertices = hand.posed(frame.pose).vertices
-        is_seen = seen_vertices(vertices, rig.faces, frame)
+        is_seen = seen_vertices(vertices, rig.faces, frame.camera, frame.known)
         x, y = project(frame.camera, vertices)[0].floor().long().unbind(-1)
         x, y = x.clamp(0, frame.camera.width - 1), y.clamp(0, frame.camera.height - 1)
         values = frame.image[y, x].float()

@@ -28,7 +28,8 @@ from handavatar.hand.rig import Rig
 from handavatar.jobs.threads import one_thread
 
 _LONG_FINGERS = ("index", "middle", "ring", "little")
-_PALM_LANDMARKS = (0, 1, 5, 9, 13, 17)
+PALM_LANDMARKS = (0, 1, 5, 9, 13, 17)
+"""Those that move least with the fingers."""
 _RETRY_GESTURES = ("fist", "relaxed", "pinch")
 _BAD_RATIO = 1.6
 LANDMARK_ERROR = 0.004
@@ -341,8 +342,8 @@ def initial_fit(model: HandModel, observations: Observations, options: FitOption
         torch.zeros(21, 3),
     )
     seen = observations.world_landmarks
-    palm = list(_PALM_LANDMARKS)
-    turn = _aligning_rotation(model.landmarks(fit)[:, palm], seen[:, palm])
+    palm = list(PALM_LANDMARKS)
+    turn = aligning_rotation(model.landmarks(fit)[:, palm], seen[:, palm])
     fit.rotations[:, 0] = axis_angle_from_matrix(turn)
     fit = _fitted_to_world_landmarks(model, fit, seen)
     return placed(model, observations, fit)
@@ -549,7 +550,7 @@ def _robust(ratio: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     return torch.log1p(0.5 * ratio.square()) * 2
 
 
-def _aligning_rotation(
+def aligning_rotation(
     source: Float[Tensor, "frames points 3"], target: Float[Tensor, "frames points 3"]
 ) -> Float[Tensor, "frames 3 3"]:
     """The rotation that best lays ``source`` on ``target``, both about their means."""
@@ -565,7 +566,7 @@ def _fitted_to_world_landmarks(
     model: HandModel, fit: HandFit, seen: Float[Tensor, "frames 21 3"]
 ) -> HandFit:
     """Joint rotations by the tracker's 3D landmarks, whose hand is brought to the rig's size."""
-    palm = list(_PALM_LANDMARKS)
+    palm = list(PALM_LANDMARKS)
     seen = seen - seen[:, palm].mean(1, keepdim=True)
     rest = model.landmarks(fit)
     size = (rest[:, palm] - rest[:, palm].mean(1, keepdim=True)).norm(dim=-1).mean(1)

@@ -9,6 +9,7 @@ middle, so that whatever camera sees the start goes on seeing the hand.
 import json
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from handavatar.capture.checks import CaptureError, load_json, number, numbers
-from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from handavatar.geometry.rotations import (
+    axis_angle_from_matrix,
+    matrix_from_axis_angle,
+    rotations_between,
+)
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import (
     GESTURES,
@@ -29,6 +34,8 @@ from handavatar.hand.pose_sampling import (
 from handavatar.hand.rig import Rig
 
 SCHEMA = 1
+LONG_GAP = 0.75
+"""Seconds without a pose that are told."""
 MAX_STEPS = 100_000
 
 _OPEN = (0.0, 3.0, 1.0, 0.0)
@@ -236,6 +243,44 @@ def write_motion(path: Path, motion: Motion) -> None:
         os.replace(aside, path)
     finally:
         aside.unlink(missing_ok=True)
+
+
+def evenly_spaced(
+    times: Float[Tensor, "seen"],
+    rotations: Float[Tensor, "seen bones 3 3"],
+    translations: Float[Tensor, "seen 3"],
+    fps: float,
+    tell: Callable[[str], None],
+) -> Motion:
+    """A motion at equal steps out of poses at given times; turns between two are the shortest.
+
+    Args:
+        times: seconds, growing.
+        rotations: relative to the parent bone.
+        translations: metres.
+        fps: steps a second.
+        tell: called where there is no pose for long.
+
+    Raises:
+        CaptureError: these are more steps than a motion may have.
+    """
+    count = int(float(times[-1] - times[0]) * fps + 1e-6) + 1
+    if count > MAX_STEPS:
+        raise CaptureError(
+            f"{count} steps at {fps:g} a second; {MAX_STEPS} at most", "choose a smaller --fps"
+        )
+    if len(times) == 1:
+        return Motion(fps, axis_angle_from_matrix(rotations).float(), translations.float())
+    gaps = times.diff()
+    for start, gap in zip(times, gaps, strict=False):
+        if float(gap) > LONG_GAP:
+            tell(f"no pose from {float(start):.1f} s for {float(gap):.1f} s: the hand glides there")
+    moments = times[0] + torch.arange(count) / fps
+    after = torch.searchsorted(times, moments).clamp(1, len(times) - 1)
+    share = ((moments - times[after - 1]) / gaps[after - 1]).clamp(0, 1).to(rotations)
+    between = rotations_between(rotations[after - 1], rotations[after], share[:, None, None])
+    places = torch.lerp(translations[after - 1], translations[after], share[:, None])
+    return Motion(fps, axis_angle_from_matrix(between).float(), places.float())
 
 
 def gesture(rig: Rig, name: str) -> Float[Tensor, "bones 3"]:

@@ -1,42 +1,61 @@
-"""Motions from what was filmed: the poses of a capture, or of a video, at equal steps of time."""
+"""Motions from what was filmed, or from other programs' files, at equal steps of time."""
 
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import torch
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import Tell
 from handavatar.capture.frames import Capture, read_capture
-from handavatar.capture.motion import MAX_STEPS, Motion
+from handavatar.capture.motion import MAX_STEPS, Motion, evenly_spaced
+from handavatar.capture.motion_files.conversion import motion_of_file
+from handavatar.capture.motion_files.stored import is_motion_file
+from handavatar.capture.motion_files.track import Conventions, LayoutName
+from handavatar.capture.motion_files.trackers import is_hawor
 from handavatar.capture.video import VideoOptions, capture_video
-from handavatar.geometry.rotations import (
-    axis_angle_from_matrix,
-    matrix_from_axis_angle,
-    rotations_between,
-)
+from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.hand.rigs import load_rig
 
-_LONG_GAP = 0.75
-"""Seconds without a pose that are told."""
 _MOST_FPS = 240.0
 
 
 @dataclass(frozen=True)
 class MotionFromOptions:
-    """From a capture or a video to a motion that drives any avatar of the same rig."""
+    """From a capture, a video or another program's file to a motion that drives any avatar."""
 
     source: Path
-    """A capture, or a video or a folder of pictures as capture video reads them."""
+    """A capture; a video or a folder of pictures as capture video reads them; or a file, or a
+    folder of files, of HaMeR, WiLoR, HaWoR, MANO, ARCTIC, InterHand2.6M, AMASS or SOMA-X."""
     out: Path
     """Motion file, such as wave.json."""
     fps: float | None = None
-    """Steps a second; by default those of the source."""
+    """Steps a second; by default those of the source. A file that does not say its own needs it."""
     keep: Path | None = None
     """Folder in which the capture of a video is kept."""
     rig: str = "open-hand"
-    """The hand to lay onto a video: open-hand, an imported one (mano-right) or its file."""
+    """The hand to lay onto a video, and that a file's poses are carried over to: that of the avatar
+    to be driven: open-hand, an imported one (mano-right) or its file."""
+    layout: LayoutName = "auto"
+    """What wrote a file; auto takes it only from files that tell it for certain."""
+    side: Literal["auto", "left", "right"] = "auto"
+    """Which hand of a file; must be said where it holds both or does not tell."""
+    mano: str | None = None
+    """Your own MANO_RIGHT.pkl or MANO_LEFT.pkl, or an imported rig; by default the imported one."""
+    flat_hand_mean: Literal["auto", "true", "false"] = "auto"
+    """As in smplx: true if a file's finger poses count from the flat hand, false if from MANO's
+    mean pose. Must be said for MANO's parameters."""
+    use_pca: bool = False
+    """As in smplx: a file's finger poses are MANO's principal components."""
+    unit: Literal["m", "cm", "mm"] = "m"
+    """Of a file's translations."""
+    axes: Literal["opencv", "opengl"] = "opencv"
+    """Of a file's camera; opengl has y up and z backwards."""
+    focal: float | None = None
+    """True focal length in pixels of the pictures that HaMeR or WiLoR saw, for their depths."""
 
 
 def motion_from(
@@ -44,7 +63,7 @@ def motion_from(
     tell: Tell,
     progress: Callable[[float, str], None] | None = None,
 ) -> Motion:
-    """The motion of a hand that was filmed.
+    """The motion of a hand that was filmed, or that another program's file holds.
 
     Args:
         options: of what.
@@ -52,10 +71,25 @@ def motion_from(
         progress: called with the share of a video's work that is done.
 
     Raises:
-        CaptureError: there is no hand in it, or the poses have no times.
+        CaptureError: there is no hand in it, the poses have no times, or a file is not what it is
+            said to be.
+        LicensedRigMissing: a file cannot be read without the user's own MANO file.
     """
     if (options.source / "transforms.json").is_file():
         return motion_of_capture(read_capture(options.source), options.fps, tell)
+    is_told = options.layout != "auto"
+    if is_told or is_motion_file(options.source) or is_hawor(options.source, {}):
+        conventions = Conventions(
+            options.layout,
+            options.side,
+            options.flat_hand_mean,
+            options.use_pca,
+            options.unit,
+            options.axes,
+            options.focal,
+        )
+        rig = load_rig(options.rig)
+        return motion_of_file(options.source, rig, conventions, options.mano, options.fps, tell)
     with tempfile.TemporaryDirectory() as aside:
         out = options.keep or Path(aside) / "capture"
         # For a motion ten pictures a second are few.
@@ -85,21 +119,9 @@ def motion_of_capture(capture: Capture, fps: float | None, tell: Tell) -> Motion
             "give a capture of a video, or one whose frames have their time in seconds",
         )
     rate = fps or min(_MOST_FPS, 1 / float(gaps.median()))
-    count = int(float(times[-1] - times[0]) * rate + 1e-6) + 1
-    if count > MAX_STEPS:
-        raise CaptureError(
-            f"{capture.folder}: {count} steps at {rate:g} a second; {MAX_STEPS} at most",
-            "choose a smaller --fps",
-        )
-    for start, gap in zip(times, gaps, strict=False):
-        if float(gap) > _LONG_GAP:
-            tell(f"no pose from {float(start):.1f} s for {float(gap):.1f} s: the hand glides there")
-    moments = times[0] + torch.arange(count) / rate
-    after = torch.searchsorted(times, moments).clamp(1, len(times) - 1)
-    share = ((moments - times[after - 1]) / gaps[after - 1]).clamp(0, 1).float()
     rotations = torch.stack([record.pose.rotations for record in records]).float()
     translations = torch.stack([record.pose.translation for record in records]).float()
-    matrices = matrix_from_axis_angle(rotations)
-    between = rotations_between(matrices[after - 1], matrices[after], share[:, None, None])
-    places = torch.lerp(translations[after - 1], translations[after], share[:, None])
-    return Motion(rate, axis_angle_from_matrix(between), places)
+    try:
+        return evenly_spaced(times, matrix_from_axis_angle(rotations), translations, rate, tell)
+    except CaptureError as error:
+        raise CaptureError(f"{capture.folder}: {error.what}", error.remedy) from error

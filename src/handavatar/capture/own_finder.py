@@ -22,7 +22,7 @@ from handavatar.tracker.model import TrainedTracker, shipped_tracker
 from handavatar.tracker.network import HAND, INPUT_SIDE, MAP_SIDE
 from handavatar.tracker.points import upright_turn
 
-_SIZES = (1.1, 0.75, 0.5, 0.34)
+SEARCHED_SIZES = (1.1, 0.75, 0.5, 0.34)
 """Sides of the crops that are asked first, in units of the picture's shorter side."""
 _OF_EACH_SIZE = 3
 _ROUNDS_OF_SEARCH, _ROUNDS_OF_FOLLOWING = 4, 2
@@ -49,13 +49,15 @@ _UNCLEAR_VOTE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
+class SeenCrop:
     """What the network saw in a look.
 
     Attributes:
         look: where.
         points: landmarks and skin, pixels of the picture.
+        point_errors: expected, of each coordinate, pixels of the picture.
         depths: behind the wrist, in units of the hand's size.
+        depth_errors: expected.
         error: expected one, mean over the points, in units of the crop's side.
         presence: probability of a hand.
         right: logit of its being a right one as looked at, so a left one where it is mirrored.
@@ -66,7 +68,9 @@ class _Seen:
 
     look: Look
     points: Float[np.ndarray, "points 2"]
+    point_errors: Float[np.ndarray, "points"]
     depths: Float[np.ndarray, "points"]
+    depth_errors: Float[np.ndarray, "points"]
     error: float
     presence: float
     right: float
@@ -150,28 +154,30 @@ class OwnFinder:
         x, y = (low + high) / 2
         side = float((high - low).max()) * 1.5
         looks = [Look((float(x), float(y)), side, upright + turn, flip) for flip in (False, True)]
-        first, second = sorted(self._ask(image, looks), key=lambda seen: -seen.right)
-        if not _is_followed(first, image):
+        first, second = sorted(ask_looks(self._tracker, image, looks), key=lambda seen: -seen.right)
+        if not is_hand_followed(first, image):
             return None
         return self._sighting(first, second)
 
     def _followed(
         self, image: UInt8[np.ndarray, "height width 3"], look: Look
-    ) -> tuple[_Seen, _Seen] | None:
+    ) -> tuple[SeenCrop, SeenCrop] | None:
         looks = [look, replace(look, is_mirrored=not look.is_mirrored)]
-        pair = self._refined(image, looks, _ROUNDS_OF_FOLLOWING)
+        pair = refine_looks(self._tracker, image, looks, _ROUNDS_OF_FOLLOWING)
         short_side = float(min(image.shape[:2]))
         first, second = sorted(pair, key=lambda seen: -seen.score(short_side))
-        if not _is_followed(first, image):
+        if not is_hand_followed(first, image):
             return None
         # What has shrunk to a finger, or has grown over the picture, is no longer the hand.
         if not 0.5 < first.look.side / look.side < 2.0:
             return None
         return first, second
 
-    def _searched(self, image: UInt8[np.ndarray, "height width 3"]) -> list[tuple[_Seen, _Seen]]:
-        looks = _looks_all_over(image.shape[1], image.shape[0])
-        seen = self._ask(image, looks)
+    def _searched(
+        self, image: UInt8[np.ndarray, "height width 3"]
+    ) -> list[tuple[SeenCrop, SeenCrop]]:
+        looks = looks_all_over(image.shape[1], image.shape[0])
+        seen = ask_looks(self._tracker, image, looks)
         sides = sorted({look.side for look in looks})
         chosen = []
         for side in sides:
@@ -179,92 +185,136 @@ class OwnFinder:
             of_size.sort(key=lambda one: 2 * one.error - one.presence)
             chosen += [one.look for one in of_size[:_OF_EACH_SIZE]]
         both = [replace(look, is_mirrored=flip) for look in chosen for flip in (False, True)]
-        refined = self._refined(image, both, _ROUNDS_OF_SEARCH)
+        refined = refine_looks(self._tracker, image, both, _ROUNDS_OF_SEARCH)
         short_side = float(min(image.shape[:2]))
         pairs = []
         for one, other in zip(refined[::2], refined[1::2], strict=True):
             first, second = sorted((one, other), key=lambda seen: -seen.score(short_side))
-            is_hand = first.presence >= _LEAST_PRESENCE and first.vagueness <= _MOST_ERROR
-            if is_hand and first.motion <= _MOST_MOTION and _is_large(first, image):
+            if is_hand_found(first, image):
                 pairs.append((first, second))
         pairs.sort(key=lambda pair: -pair[0].score(short_side))
         apart = _without_doubles(pairs)
         return apart[:1] + [pair for pair in apart[1:2] if pair[0].vagueness <= _SECOND_ERROR]
 
-    def _refined(
-        self, image: UInt8[np.ndarray, "height width 3"], looks: Sequence[Look], rounds: int
-    ) -> list[_Seen]:
-        seen = self._ask(image, looks)
-        for _ in range(rounds):
-            before = seen
-            seen = [
-                replace(
-                    now,
-                    motion=float(
-                        np.linalg.norm(now.points - then.points, axis=-1).mean() / now.look.side
-                    ),
-                )
-                for now, then in zip(
-                    self._ask(image, [one.again() for one in before]), before, strict=True
-                )
-            ]
-        return seen
-
-    def _ask(
-        self, image: UInt8[np.ndarray, "height width 3"], looks: Sequence[Look]
-    ) -> list[_Seen]:
-        placed = [look.picture_from_crop() for look in looks]
-        crops = [resampled(image, matrix, corner, INPUT_SIDE) for matrix, corner in placed]
-        told = self._tracker.tell(np.stack(crops))
-        is_hand = (told.classes.argmax(1) == HAND).numpy()
-        found = []
-        for number, (look, (matrix, corner)) in enumerate(zip(looks, placed, strict=True)):
-            places = told.places[number].double().numpy() * INPUT_SIDE
-            found.append(
-                _Seen(
-                    look,
-                    places @ matrix.T + corner,
-                    told.depths[number].double().numpy(),
-                    float(told.place_errors[number].mean()),
-                    float(told.is_hand[number].sigmoid()),
-                    float(told.is_right[number]),
-                    _cell_middles(is_hand[number]) @ matrix.T + corner,
-                    _border_share(is_hand[number]),
-                )
-            )
-        return found
-
-    def _sighting(self, first: _Seen, second: _Seen) -> Sighting:
-        preferred = (first.right - second.right) / 2
-        is_right = not first.look.is_mirrored
-        if preferred < 0:
-            is_right = not is_right
-        is_clear = abs(preferred) >= _CLEAR_SIDE and first.vagueness <= _CLEAR_ERROR
-        sure = first.presence * math.tanh(abs(preferred)) * (1.0 if is_clear else _UNCLEAR_VOTE)
+    def _sighting(self, first: SeenCrop, second: SeenCrop) -> Sighting:
+        vote = side_vote(first, second)
         landmarks = first.points[:NUM_LANDMARKS]
         return Sighting(
             landmarks,
             world_places(self._tracker.points, landmarks, first.depths[:NUM_LANDMARKS]),
             first.presence,
-            is_right,
-            sure if is_right else -sure,
+            # Of no certainty at all it is what it was looked at as.
+            not first.look.is_mirrored if vote == 0 else vote > 0,
+            vote,
         )
 
 
-def _is_large(seen: _Seen, image: UInt8[np.ndarray, "height width 3"]) -> bool:
-    return seen.extent >= _SMALLEST * min(image.shape[:2])
+def refine_looks(
+    tracker: TrainedTracker,
+    image: UInt8[np.ndarray, "height width 3"],
+    looks: Sequence[Look],
+    rounds: int,
+) -> list[SeenCrop]:
+    """Looks, and looks again about what was seen.
+
+    Args:
+        tracker: to ask.
+        image: the whole picture.
+        looks: where to begin.
+        rounds: of looking again; the answers are those of the last.
+    """
+    seen = ask_looks(tracker, image, looks)
+    for _ in range(rounds):
+        before = seen
+        seen = [
+            replace(
+                now,
+                motion=float(
+                    np.linalg.norm(now.points - then.points, axis=-1).mean() / now.look.side
+                ),
+            )
+            for now, then in zip(
+                ask_looks(tracker, image, [one.again() for one in before]), before, strict=True
+            )
+        ]
+    return seen
 
 
-def _is_followed(seen: _Seen, image: UInt8[np.ndarray, "height width 3"]) -> bool:
-    """Whether it is believed where a hand has been before."""
+def ask_looks(
+    tracker: TrainedTracker, image: UInt8[np.ndarray, "height width 3"], looks: Sequence[Look]
+) -> list[SeenCrop]:
+    """What the network says of crops of a picture, all at once.
+
+    Args:
+        tracker: to ask.
+        image: the whole picture.
+        looks: where.
+    """
+    placed = [look.picture_from_crop() for look in looks]
+    crops = [resampled(image, matrix, corner, INPUT_SIDE) for matrix, corner in placed]
+    told = tracker.tell(np.stack(crops))
+    is_hand = (told.classes.argmax(1) == HAND).numpy()
+    found = []
+    for number, (look, (matrix, corner)) in enumerate(zip(looks, placed, strict=True)):
+        places = told.places[number].double().numpy() * INPUT_SIDE
+        errors = told.place_errors[number].double().numpy()
+        found.append(
+            SeenCrop(
+                look,
+                places @ matrix.T + corner,
+                errors * look.side,
+                told.depths[number].double().numpy(),
+                told.depth_errors[number].double().numpy(),
+                float(told.place_errors[number].mean()),
+                float(told.is_hand[number].sigmoid()),
+                float(told.is_right[number]),
+                _cell_middles(is_hand[number]) @ matrix.T + corner,
+                _border_share(is_hand[number]),
+            )
+        )
+    return found
+
+
+def is_hand_found(seen: SeenCrop, image: UInt8[np.ndarray, "height width 3"]) -> bool:
+    """Whether a hand is believed of which nothing was known, after looking again."""
+    is_hand = seen.presence >= _LEAST_PRESENCE and seen.vagueness <= _MOST_ERROR
+    return is_hand and seen.motion <= _MOST_MOTION and _is_large(seen, image)
+
+
+def is_hand_followed(seen: SeenCrop, image: UInt8[np.ndarray, "height width 3"]) -> bool:
+    """Whether a hand is believed where one has been before."""
     is_hand = seen.presence >= _LEAST_PRESENCE_FOLLOWED
     return is_hand and seen.vagueness <= _MOST_ERROR_FOLLOWED and _is_large(seen, image)
 
 
-def _looks_all_over(width: int, height: int) -> list[Look]:
-    """Crops of every size that overlap by half."""
+def side_vote(first: SeenCrop, second: SeenCrop) -> float:
+    """Certainty of a right hand, negative of a left one, in [-1, 1].
+
+    Args:
+        first: of a crop, the look that sees it better.
+        second: the look at the same crop in the mirror, or out of it.
+    """
+    preferred = (first.right - second.right) / 2
+    is_clear = abs(preferred) >= _CLEAR_SIDE and first.vagueness <= _CLEAR_ERROR
+    sure = first.presence * math.tanh(abs(preferred)) * (1.0 if is_clear else _UNCLEAR_VOTE)
+    is_right = (preferred >= 0) != first.look.is_mirrored
+    return sure if is_right else -sure
+
+
+def _is_large(seen: SeenCrop, image: UInt8[np.ndarray, "height width 3"]) -> bool:
+    return seen.extent >= _SMALLEST * min(image.shape[:2])
+
+
+def looks_all_over(width: int, height: int, sizes: Sequence[float] = SEARCHED_SIZES) -> list[Look]:
+    """Crops of every size that overlap by half.
+
+    Args:
+        width: of the picture.
+        height: of the picture.
+        sizes: sides, in units of the picture's shorter side.
+    """
     looks = []
-    for share in _SIZES:
+    for share in sizes:
         side = share * min(width, height)
         columns, rows = (_middles(length, side) for length in (width, height))
         looks += [Look((x, y), side, 0.0) for y in rows for x in columns]
@@ -289,9 +339,9 @@ def _border_share(is_hand: Bool[np.ndarray, "rows columns"]) -> float:
     return float(np.concatenate(edges).mean())
 
 
-def _without_doubles(pairs: list[tuple[_Seen, _Seen]]) -> list[tuple[_Seen, _Seen]]:
+def _without_doubles(pairs: list[tuple[SeenCrop, SeenCrop]]) -> list[tuple[SeenCrop, SeenCrop]]:
     """Leaves what lies where a better one does; the better ones come first."""
-    kept: list[tuple[_Seen, _Seen]] = []
+    kept: list[tuple[SeenCrop, SeenCrop]] = []
     for pair in pairs:
         look = pair[0].look
         apart = [

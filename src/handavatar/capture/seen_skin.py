@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from handavatar.capture.frames import Frame
-from handavatar.geometry.cameras import project
+from handavatar.geometry.cameras import Camera, project
 from handavatar.geometry.meshes import face_cross_products, vertex_normals
 from handavatar.hand.pose import BONE_NAMES, FINGER_BONES
 from handavatar.hand.rig import Rig
@@ -53,12 +53,25 @@ def count_seen_skin(
     hand = rig.shaped(coefficients)
     counts = torch.zeros(rig.num_vertices, dtype=torch.long)
     for frame in frames:
-        counts += seen_vertices(hand.posed(frame.pose).vertices, rig.faces, frame)
-    area = torch.zeros(rig.num_vertices)
-    per_corner = face_cross_products(hand.rest_vertices, rig.faces).norm(dim=-1) / 6
-    area.index_add_(0, rig.faces.flatten(), per_corner.repeat_interleave(3))
+        vertices = hand.posed(frame.pose).vertices
+        counts += seen_vertices(vertices, rig.faces, frame.camera, frame.known)
+    area = vertex_areas(hand.rest_vertices, rig.faces)
     unseen = area * (counts == 0)
     return SeenSkin(counts, float(unseen.sum() / area.sum()), unseen_regions(rig, area, unseen))
+
+
+def vertex_areas(
+    vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"]
+) -> Float[Tensor, "vertices"]:
+    """A third of each face's area for each of its corners, square metres.
+
+    Args:
+        vertices: of a mesh, metres.
+        faces: of the mesh.
+    """
+    area = torch.zeros(len(vertices))
+    per_corner = face_cross_products(vertices, faces).norm(dim=-1) / 6
+    return area.index_add_(0, faces.flatten(), per_corner.repeat_interleave(3))
 
 
 def unseen_regions(
@@ -80,26 +93,32 @@ def unseen_regions(
 
 @torch.no_grad()
 def seen_vertices(
-    vertices: Float[Tensor, "vertices 3"], faces: Int[Tensor, "faces 3"], frame: Frame
+    vertices: Float[Tensor, "vertices 3"],
+    faces: Int[Tensor, "faces 3"],
+    camera: Camera,
+    known: Bool[Tensor, "height width"],
+    least_cosine: float = _FACING,
 ) -> Bool[Tensor, "vertices"]:
     """Which vertices of a mesh face the camera, unhidden, in a known pixel.
 
     Args:
         vertices: of the posed hand, metres, world.
         faces: of its mesh.
-        frame: camera and known pixels; its pose plays no part.
+        camera: of the picture.
+        known: pixels of it that show what is there.
+        least_cosine: between normal and line of sight; flatter skin counts as not seen.
     """
-    camera = frame.camera.to(vertices.device)
+    camera = camera.to(vertices.device)
     pixels, depths = project(camera, vertices)
     rotation, shift = camera.camera_from_world.split([3, 1], dim=-1)
     eye = -(rotation[:3].T @ shift[:3, 0])
     towards = torch.nn.functional.normalize(eye - vertices, dim=-1)
-    faces_camera = (vertex_normals(vertices, faces) * towards).sum(-1) > _FACING
+    faces_camera = (vertex_normals(vertices, faces) * towards).sum(-1) > least_cosine
     x, y = pixels.floor().long().unbind(-1)
     is_inside = (x >= 0) & (y >= 0) & (x < camera.width) & (y < camera.height)
     x, y = x.clamp(0, camera.width - 1), y.clamp(0, camera.height - 1)
     nearest = rasterize(vertices, faces, camera).depth
-    known = frame.known.to(vertices.device)
+    known = known.to(vertices.device)
     return faces_camera & is_inside & known[y, x] & (depths < nearest[y, x] + _HIDDEN)
 
 

@@ -195,20 +195,7 @@ def capture_video(
         raise ValueError(f"{len(videos)} videos, at most {MAX_CLIPS} of one hand")
     cameras = [read_camera(video.camera[0]) if video.camera else None for video in videos]
     rig = rig or load_rig(options.rig)
-    header = {
-        "rig_name": rig.name,
-        "rig_sha256": rig.sha256,
-        "subject": options.subject,
-        "source": ", ".join(video.file.name for video in videos),
-        "licence": options.licence,
-        "overwrite": options.overwrite,
-        "inputs": (
-            *(video.file for video in videos),
-            *options.masks,
-            *options.camera,
-            *files_named(options.rig),
-        ),
-    }
+    header = _header(options, rig)
     CaptureWriter(options.out, **header)  # type: ignore[arg-type]  # refuses a folder in use now
     clips: list[Clip] = []
     for number, (video, camera) in enumerate(zip(videos, cameras, strict=True)):
@@ -261,6 +248,32 @@ def capture_video(
         overview(tried, writer.file("overview.png"))
     report(1.0, "done")
     return read_capture(options.out)
+
+
+def refuse_capture_in_use(options: VideoOptions) -> None:
+    """Refuses what :func:`capture_video` would refuse, before there is a video.
+
+    Raises:
+        CaptureError: the folder is in use.
+        RigError: there is no such rig.
+        ValueError: no picture would be selected.
+    """
+    options.sampling()
+    CaptureWriter(options.out, **_header(options, load_rig(options.rig)))  # type: ignore[arg-type]
+
+
+def _header(options: VideoOptions, rig: Rig) -> dict[str, object]:
+    """What a capture says of itself, and what it may not be written over."""
+    files = (options.file, *options.more)
+    return {
+        "rig_name": rig.name,
+        "rig_sha256": rig.sha256,
+        "subject": options.subject,
+        "source": ", ".join(file.name for file in files),
+        "licence": options.licence,
+        "overwrite": options.overwrite,
+        "inputs": (*files, *options.masks, *options.camera, *files_named(options.rig)),
+    }
 
 
 def _told_alone(clip: TriedClip) -> TriedClip:

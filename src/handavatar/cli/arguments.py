@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args, get_origin
 
@@ -56,8 +57,22 @@ def parse_with(
     words: list[str],
     command: str,
     positional: tuple[str, ...] = (),
+    given: Mapping[str, Any] | None = None,
+    about: str = "",
 ) -> tuple[Options, dict[str, Any]]:
     """As :func:`parse`, with the values of further options by name.
+
+    Fields in ``given`` have these values, and no word sets them, unless an extra has their name:
+    if it is set, its value is the field's as well.
+
+    Args:
+        options: as for :func:`parse`.
+        extras: further options.
+        words: after the command's name.
+        command: for the usage line.
+        positional: fields that stand without a name, in this order.
+        given: values of fields.
+        about: says what the command does, if the options' documentation does not.
 
     Tyro reads a subclass of the dataclass that carries the command line's own conventions, so
     that the code it serves need not know them.
@@ -69,7 +84,15 @@ def parse_with(
         kind = _positional(named, extra.name) if extra.is_positional else named
         fields.append((extra.name, kind, dataclasses.field(default=default)))
     own = dataclasses.fields(options)  # type: ignore[arg-type]
+    taken, values = {extra.name for extra in extras}, dict(given or {})
     for field in own:
+        if field.name in taken:
+            continue
+        if field.name in values:
+            fixed: Any = Annotated[field.type, tyro.conf.Fixed, tyro.conf.Suppress]
+            default = dataclasses.field(default=values[field.name])
+            fields.append((field.name, fixed, default))
+            continue
         named = _comma_separated(field.type)
         kind = _positional(named, field.name) if field.name in positional else named
         # Either of the two is MISSING, which stands for none.
@@ -78,12 +101,14 @@ def parse_with(
     twin = dataclasses.make_dataclass(
         options.__name__, fields, bases=(options,), kw_only=True, frozen=True
     )
-    twin.__doc__ = options.__doc__
+    twin.__doc__ = about or options.__doc__
     parsed: Any = tyro.cli(
         twin, args=words, prog=f"handavatar {command}", config=(tyro.conf.FlagCreatePairsOff,)
     )
+    found = {field.name: getattr(parsed, field.name) for field in own}
+    found |= {name: value for name, value in values.items() if found[name] is None}
     return (
-        options(**{field.name: getattr(parsed, field.name) for field in own}),
+        options(**found),
         {extra.name: getattr(parsed, extra.name) for extra in extras},
     )
 

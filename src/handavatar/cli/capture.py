@@ -1,9 +1,9 @@
 """``handavatar capture``: make captures and check them."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from handavatar.cli.failures import BAD_DATA
 
@@ -20,6 +20,78 @@ def video(words: list[str]) -> int:
     for asked in options.of_each_hand():
         _capture_hand(asked)
     return 0
+
+
+_WEBCAM = """From your hand before a webcam to a capture.
+
+A page, opened in a browser of the machine with the camera, shows the hand live: which skin has been
+seen well, what to show next, and what is wrong. It records; when you press stop, the recording is
+kept beside OUT, and the command goes on as `handavatar capture video` does.
+"""
+
+
+def webcam(words: list[str]) -> int:
+    """A hand before the webcam -> capture; a page says what to show; --drive: an avatar follows."""
+    from handavatar.capture.video import VideoOptions
+    from handavatar.cli.arguments import Extra, parse_with
+
+    extras = (
+        Extra(
+            "out",
+            Path | None,
+            "folder of the capture; the recording is kept beside it, with an ending. Not needed "
+            "with --drive: then nothing is recorded",
+            None,
+        ),
+        Extra(
+            "drive",
+            Path | None,
+            "run folder or file of an avatar, which follows the hand beside the camera's picture",
+            None,
+        ),
+        Extra("port", int, "of the page; if it is taken, the next free one", 7007),
+        Extra("host", str, "where the page listens, as for view", "127.0.0.1"),
+        Extra("token", str, "who does not know it does not see the page, as for view", ""),
+    )
+    options, values = parse_with(
+        VideoOptions,
+        extras,
+        words,
+        "capture webcam",
+        given={"file": Path(), "out": Path()},
+        about=_WEBCAM,
+    )
+    recording = _record(options, values)
+    if recording is None:
+        return 0
+    print(f"recorded: {recording}", flush=True)
+    try:
+        for asked in replace(options, file=recording).of_each_hand():
+            _capture_hand(asked)
+    except BaseException:
+        print(f"the recording is kept; handavatar capture video {recording} goes on", flush=True)
+        raise
+    return 0
+
+
+def _record(options: "VideoOptions", values: dict[str, Any]) -> Path | None:
+    """The recording of a page; None if none was wanted. What is wrong is said before it opens."""
+    from handavatar.capture.video import refuse_capture_in_use
+    from handavatar.view.webcam import WebcamOptions, record_webcam
+
+    out, drive = values["out"], values["drive"]
+    if out is None and drive is None:
+        raise ValueError("--out: say where the capture is to be, or --drive an avatar")
+    sampling = options.sampling()
+    longest = sampling.wanted(sampling.max_frames)
+    if sampling.end is not None:
+        longest = min(longest, sampling.end)
+    if out is not None:
+        for asked in options.of_each_hand():
+            refuse_capture_in_use(asked)
+    place = values["port"], values["host"], values["token"]
+    asked_page = WebcamOptions(out, drive, options.side, options.fit.focal_share, longest, *place)
+    return record_webcam(asked_page)
 
 
 def _capture_hand(options: "VideoOptions") -> None:

@@ -2,7 +2,7 @@
 
 
 def from_source(words: list[str]) -> int:
-    """A capture or a video -> motion file that drives any avatar."""
+    """A capture, a video or another tool's file -> motion that drives any avatar."""
     from handavatar.capture.motion import write_motion
     from handavatar.capture.motion_import import MotionFromOptions, motion_from
     from handavatar.cli.arguments import parse
@@ -21,4 +21,16 @@ def from_source(words: list[str]) -> int:
         print(f"note: {note}")
     print(f"motion: {options.out}, {len(motion)} steps at {motion.fps:.4g} a second")
     print(f"next: handavatar render RUN --motion {options.out}")
+    return 0
+
+
+def to_file(words: list[str]) -> int:
+    """A motion -> npz of SOMA-X, to move other hands and bodies."""
+    from handavatar.capture.motion_export import MotionToOptions, motion_to
+    from handavatar.cli.arguments import parse
+
+    options = parse(MotionToOptions, words, "motion to", positional=("source",))
+    motion = motion_to(options)
+    print(f"SOMA-X: {options.out}, {len(motion)} steps at {motion.fps:.4g} a second")
+    print("next: SOMAHandLayer.pose(poses, absolute_pose=True, global_translation=transl)")
     return 0

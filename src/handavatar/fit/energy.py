@@ -174,7 +174,33 @@ def linearise_frame(
     if math.isfinite(options.contact_error):
         _add_contact(total, points, hand, skeleton, options)
     if seen.landmarks is not None:
-        _add_landmarks(total, points, skeleton, seen.picture.camera, seen.landmarks, options)
+        _add_landmarks(
+            total, points.landmarks, skeleton, seen.picture.camera, seen.landmarks, options
+        )
+    return Linearised(total.hessian, total.gradient, total.energy)
+
+
+def linearise_landmarks(
+    rest: RestPoints,
+    hand: ShapedHand,
+    pose: HandPose,
+    camera: Camera,
+    landmarks: LandmarkSightings,
+    options: EnergyOptions,
+) -> Linearised:
+    """What a tracker's landmarks alone say of one pose; the hand's shape is held still.
+
+    Args:
+        rest: what the landmarks are on the rest hand; without directions.
+        hand: the rest hand.
+        pose: where.
+        camera: of the picture.
+        landmarks: seen in it.
+        options: expected errors.
+    """
+    still = hand.rest_joints.new_zeros(*hand.rest_joints.shape, 0)
+    total = _Sum(NUM_UNKNOWNS)
+    _add_landmarks(total, rest, Skeleton.of(hand, pose, still), camera, landmarks, options)
     return Linearised(total.hessian, total.gradient, total.energy)
 
 
@@ -319,14 +345,13 @@ def _add_contact(
 
 def _add_landmarks(
     total: _Sum,
-    points: HandPoints,
+    rest: RestPoints,
     skeleton: Skeleton,
     camera: Camera,
     landmarks: LandmarkSightings,
     options: EnergyOptions,
 ) -> None:
     """A tracker's landmarks, in the picture and in depth."""
-    rest = points.landmarks
     skeleton = skeleton.padded(rest.directions.shape[-1])
     positions = skeleton.positions(rest)
     pixels, depths, moving = pixel_jacobian(camera, positions)

@@ -67,6 +67,35 @@ def array_of(value: Any, shape: tuple[int, ...], depth: int = 0) -> np.ndarray:
     return found
 
 
+def dense_array(value: Any) -> np.ndarray:
+    """The numbers of a pickled numpy array of any shape.
+
+    Args:
+        value: from :func:`~handavatar.hand.inert_pickle.read_pickle`.
+
+    Raises:
+        PickleError: it is no numpy array of numbers.
+    """
+    if not isinstance(value, InertObject) or _class_of(value) not in _RECONSTRUCT:
+        raise PickleError(f"it is {_kind(value)}, expected an array")
+    return _dense(value.state)
+
+
+def single_object(value: Any) -> Any:
+    """What a pickled array of no dimension holds: ``np.save`` writes a dictionary so.
+
+    Raises:
+        PickleError: it is no such array.
+    """
+    is_array = isinstance(value, InertObject) and _class_of(value) in _RECONSTRUCT
+    state = value.state if is_array else None
+    if not isinstance(state, tuple) or len(state) != 5 or state[1] != ():
+        raise PickleError(f"it is {_kind(value)}, expected one object in an array")
+    if not isinstance(state[4], list) or len(state[4]) != 1:
+        raise PickleError("its array does not hold one object")
+    return state[4][0]
+
+
 def text_of(value: Any) -> str:
     """Text, whichever version of Python wrote it.
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from safetensors import SafetensorError
 from safetensors import torch as safetensors_torch
 
-from handavatar.hand.mano import LICENCE, WHERE_TO_GET_IT, ManoModel
+from handavatar.hand.mano import LICENCE, WHERE_TO_GET_IT, ManoModel, read_mano
 from handavatar.hand.open_hand import Level, load_open_hand
 from handavatar.hand.rig import RIG_ARRAYS, LicensedRigMissing, Rig, RigError
 
@@ -128,23 +128,60 @@ def load_rig(reference: str, level: Level = "full") -> Rig:
         raise RigError(f"{path}: not yet a rig\nimport it: handavatar rig import-mano {path}")
     if path.suffix == ".safetensors" or path.is_file():
         return read_rig(path)
+    if reference.startswith("mano") or reference in _names_of_imported():
+        return read_rig(_named(reference))
+    known = ", ".join(["open-hand", "open-hand-778", *_names_of_imported()])
+    raise RigError(
+        f"rig {reference[:80]}: unknown\nname one of {known}, or a file that "
+        "handavatar rig import-mano wrote"
+    )
+
+
+def load_mano(reference: str) -> ManoModel:
+    """A MANO file of the user's with its mean pose and components.
+
+    Args:
+        reference: ``MANO_RIGHT.pkl`` or ``MANO_LEFT.pkl`` itself, the name of an imported rig such
+            as ``mano-right``, or the path of an imported one.
+
+    Raises:
+        LicensedRigMissing: it is not there.
+        RigError: it is no MANO file and no imported rig, or damaged.
+    """
+    path = Path(reference)
+    if path.suffix == ".pkl":
+        return read_mano(path)
+    if path.suffix != ".safetensors" and not path.is_file():
+        path = _named(reference)
+    rig, facts = read_rig(path), _facts(path)
+    arrays = safetensors_torch.load_file(path)
+    try:
+        return ManoModel(
+            rig=rig,
+            side=facts["side"],  # type: ignore[arg-type]
+            hands_mean=arrays["hands_mean"],
+            hands_components=arrays["hands_components"],
+            left_shape=facts["left_shape"],  # type: ignore[arg-type]
+            sha256=facts["source_sha256"],
+        )
+    except KeyError as error:
+        raise RigError(f"{path}: not a whole rig ({error})\nimport it again") from error
+
+
+def _named(reference: str) -> Path:
+    """The file of an imported MANO rig of this name."""
     named = [path for path, facts in _imported().items() if facts["name"] == reference]
     if len(named) > 1:
         raise RigError(
             f"{len(named)} imported rigs are named {reference}\nname one by its file: "
             + ", ".join(str(path) for path in named)
         )
-    if named:
-        return read_rig(named[0])
-    if reference.startswith("mano"):
+    if not named:
         raise LicensedRigMissing(
-            f"rig {reference}: not imported; {rigs_folder()} does not hold it\n{WHERE_TO_GET_IT}"
+            f"rig {reference[:80]}: not imported; {rigs_folder()} does not hold it\n"
+            f"{WHERE_TO_GET_IT}"
         )
-    known = ", ".join(["open-hand", "open-hand-778", *_names_of_imported()])
-    raise RigError(
-        f"rig {reference[:80]}: unknown\nname one of {known}, or a file that "
-        "handavatar rig import-mano wrote"
-    )
+    return named[0]
 
 
 def find_rig(sha256: str, name: str) -> Rig:

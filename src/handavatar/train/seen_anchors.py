@@ -27,7 +27,7 @@ def count_seen_anchors(avatar: HandAvatar, frames: Sequence[Frame]) -> None:
     for frame in frames:
         pose = frame.pose.to(avatar.device)
         vertices = avatar.coarse_personal(pose).posed(pose).vertices
-        seen = seen_vertices(vertices, base.faces, frame).to(vertices)
+        seen = seen_vertices(vertices, base.faces, frame.camera, frame.known).to(vertices)
         share = avatar.anchors.positions(carried_to_fine(seen[:, None], levels))[:, 0]
         counts += (share > 0.5).int()
     avatar.seen_frames = counts

@@ -43,7 +43,7 @@ class BakedPose:
         vertices: its own and the middle of the wrist's cut, metres, world.
         normals: of its own vertices, unit, world.
         lit_normals: of the lit anchors, unit, world.
-        surroundings: soft occupancy of every part at the lit anchors.
+        surroundings: soft occupancy of every part at the lit anchors; one, once it is needed.
         lights: at the vertices, by which light shines and which bones are lifted; filled as
             pictures need it.
     """
@@ -52,7 +52,7 @@ class BakedPose:
     vertices: Float[Tensor, "sealed_vertices 3"]
     normals: Float[Tensor, "vertices 3"]
     lit_normals: Float[Tensor, "lit 3"]
-    surroundings: Float[Tensor, "lit bones"]
+    surroundings: list[Float[Tensor, "lit bones"]]
     lights: dict[tuple[int, tuple[int, ...]], Float[Tensor, "vertices"]]
 
 
@@ -94,18 +94,23 @@ class BakedAvatar:
         self._visible: OrderedDict[tuple[int, tuple[int, ...]], Tensor] = OrderedDict()
 
     @torch.no_grad()
-    def render(self, pose: HandPose, camera: Camera, edit: Edit) -> Rendering:
+    def render(
+        self, pose: HandPose, camera: Camera, edit: Edit, lit_as: HandPose | None = None
+    ) -> Rendering:
         """As :meth:`HandAvatar.render`, but fast; the depth is left out (zero).
 
         Args:
             pose: of the hand in the world.
             camera: decides the size of the picture.
             edit: changes of the look.
+            lit_as: another pose, near this one, of which the light is known; half of a new pose's
+                time goes into its light.
         """
         baked = self.posed(pose)
+        lit = baked if lit_as is None else self.posed(lit_as)
         edit = self._avatar.edit.then(edit)
         albedo = edit.painted(edit.of_albedo(self._albedo), self._at_vertices)
-        light = edit.of_illumination(self._light(baked, edit))[:, None]
+        light = edit.of_illumination(self._light(lit, edit))[:, None]
         values = torch.cat([albedo * light, albedo, light, baked.normals], dim=-1)
         cut = values[self._avatar.rig.rim].mean(0, keepdim=True)
         camera = camera.to(self._avatar.device)
@@ -167,13 +172,17 @@ class BakedAvatar:
         posed = personal_hand(avatar.rig.shaped(avatar.coefficients), offsets).posed(pose)
         normals = vertex_normals(posed.vertices, avatar.rig.faces)
         lit_normals = torch.nn.functional.normalize(self._lit.positions(normals), dim=-1)
+        return BakedPose(posed, posed.sealed_vertices, normals, lit_normals, [], {})
+
+    def _surroundings(self, baked: BakedPose) -> Float[Tensor, "lit bones"]:
+        """What lies around the lit anchors."""
+        avatar, posed = self._avatar, baked.posed
         chosen = avatar.illumination.chosen
-        surroundings = lit_normals.new_zeros(len(lit_normals), len(pose.rotations))
-        if chosen.num_directions == 0 and chosen.name != "plain":
-            codes = avatar.occupancy.encode(avatar.parts, posed)
-            around = avatar.occupancy(codes, self._probes.positions(posed.vertices)).soft_parts
-            surroundings = self._from_probes.interpolated(around)
-        return BakedPose(posed, posed.sealed_vertices, normals, lit_normals, surroundings, {})
+        if chosen.num_directions or chosen.name == "plain":
+            return baked.lit_normals.new_zeros(len(baked.lit_normals), len(posed.pose.rotations))
+        codes = avatar.occupancy.encode(avatar.parts, posed)
+        around = avatar.occupancy(codes, self._probes.positions(posed.vertices)).soft_parts
+        return self._from_probes.interpolated(around)
 
     def _facing(
         self, vertices: Float[Tensor, "sealed_vertices 3"], camera: Camera
@@ -189,13 +198,15 @@ class BakedAvatar:
         key = (self._avatar.light_of(edit), edit.lifted_bones)
         if key not in baked.lights:
             field = self._avatar.illumination
+            if not baked.surroundings:
+                baked.surroundings.append(self._surroundings(baked))
             traced = baked.lit_normals @ field.directions.T
             if traced.shape[1]:
                 traced = traced.clamp_min(0) * self._visibility(*key)
             light = field(
                 baked.posed.pose.rotations,
                 self._at_lit,
-                edit.of_directed(baked.surroundings),
+                edit.of_directed(baked.surroundings[0]),
                 baked.lit_normals,
                 traced,
                 key[0],

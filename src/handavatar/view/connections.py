@@ -15,13 +15,17 @@ from importlib import resources
 from typing import Any, Protocol
 from urllib.parse import parse_qs, urlsplit
 
-from handavatar.view.guard import PICTURE_KIND, Guard, Refused, kind_expected
+from handavatar.view.guard import POSTED_KINDS, Guard, Refused
 from handavatar.view.scene import SceneError
 from handavatar.view.studio import MOST_PICTURE_BYTES, Interrupted
 from handavatar.view.turns import Busy, Overtaken
 
 MOST_BYTES = 64 * 1024
 """Of a request's body."""
+MOST_CAMERA_BYTES = 1 << 20
+"""Of a camera's picture."""
+MOST_PIECE_BYTES = 4 << 20
+"""Of a piece of a recording."""
 MOST_CONNECTIONS = 160
 MOST_PICTURES = 2
 """Pictures that are being received or read at a time; more are asked to try again."""
@@ -30,9 +34,15 @@ MOST_PORTS = 20
 _TIMEOUT = 20.0
 _FILES = {
     "/page.js": ("page.js", "text/javascript; charset=utf-8"),
+    "/webcam.js": ("webcam.js", "text/javascript; charset=utf-8"),
     "/training.js": ("training.js", "text/javascript; charset=utf-8"),
     "/page.css": ("page.css", "text/css; charset=utf-8"),
     "/icon.svg": ("icon.svg", "image/svg+xml"),
+}
+_MOST_POSTED = {
+    "/paint": MOST_PICTURE_BYTES,
+    "/look": MOST_CAMERA_BYTES,
+    "/recording": MOST_PIECE_BYTES,
 }
 _HEADERS = {
     "Cache-Control": "no-store",
@@ -194,12 +204,13 @@ class _Handler(BaseHTTPRequestHandler):
         length = self.headers.get("Content-Length", "")
         if not length.isdecimal() or len(length) > 9 or "Transfer-Encoding" in self.headers:
             raise Refused(411, "say how long the body is")
-        if kind_expected(self.path) != PICTURE_KIND:
+        path = self.path.partition("?")[0]
+        if path not in POSTED_KINDS:
             return self._posted_whole(int(length), MOST_BYTES)
         if not self.server.pictures.acquire(blocking=False):
             raise Busy
         try:
-            return self._posted_whole(int(length), MOST_PICTURE_BYTES)
+            return self._posted_whole(int(length), _MOST_POSTED[path])
         finally:
             self.server.pictures.release()
 

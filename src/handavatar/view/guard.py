@@ -15,9 +15,13 @@ from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
 LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
-PICTURE_KIND = "image/png"
+JSON_KIND = "application/json"
+POSTED_KINDS = {
+    "/paint": ("image/png",),
+    "/look": ("image/jpeg",),
+    "/recording": ("video/webm", "video/mp4"),
+}
 """What a page may send besides JSON: like it, no foreign form can without asking first."""
-_PICTURE_PATH = "/paint"
 _MOST_TOKEN = 200
 
 
@@ -71,8 +75,8 @@ class Guard:
         if self.token and not self._is_token(given_token(target, headers, self.cookie)):
             raise Refused(401, "open the address with its token, as the terminal prints it")
         kind = headers.get("Content-Type", "").partition(";")[0].strip().lower()
-        if method == "POST" and kind != kind_expected(target):
-            raise Refused(415, f"expected {kind_expected(target)}")
+        if method == "POST" and kind not in kinds_expected(target):
+            raise Refused(415, f"expected {' or '.join(kinds_expected(target))}")
 
     def _is_own_name(self, name: str) -> bool:
         if is_loopback(self.host):
@@ -84,9 +88,9 @@ class Guard:
         return hmac.compare_digest(given.encode("utf-8", "replace"), self.token.encode("utf-8"))
 
 
-def kind_expected(target: str) -> str:
-    """The media type of what is posted to an address."""
-    return PICTURE_KIND if target == _PICTURE_PATH else "application/json"
+def kinds_expected(target: str) -> tuple[str, ...]:
+    """The media types of what may be posted to an address."""
+    return POSTED_KINDS.get(target.partition("?")[0], (JSON_KIND,))
 
 
 def guard_of(host: str, token: str) -> Guard:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol, TypeVar, runtime_checkable
 
 import torch
 
@@ -122,12 +123,7 @@ class ViewServer:
     @property
     def address(self) -> str:
         """What to open in a browser, the token included."""
-        host = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(
-            self.guard.host, self.guard.host
-        )
-        host = f"[{host}]" if ":" in host else host
-        query = f"?token={self.guard.token}" if self.guard.token else ""
-        return f"http://{host}:{self.port}/{query}"
+        return address_of(self.guard, self.port)
 
     def serve(self) -> None:
         """Answers until :meth:`close` is called from another thread."""
@@ -139,6 +135,38 @@ class ViewServer:
         self._http.server_close()
         self._http.hang_up()
         _end(self.turns, self.films)
+
+
+@runtime_checkable
+class PageServer(Protocol):
+    """What serves a page."""
+
+    guard: Guard
+    port: int
+
+    @property
+    def address(self) -> str:
+        """What to open in a browser, the token included."""
+        ...
+
+    def serve(self) -> None:
+        """Answers until :meth:`close` is called from another thread."""
+        ...
+
+    def close(self) -> None:
+        """Stops answering and frees the port."""
+        ...
+
+
+Served = TypeVar("Served", bound=PageServer)
+
+
+def address_of(guard: Guard, port: int) -> str:
+    """What to open in a browser, the token included."""
+    host = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(guard.host, guard.host)
+    host = f"[{host}]" if ":" in host else host
+    query = f"?token={guard.token}" if guard.token else ""
+    return f"http://{host}:{port}/{query}"
 
 
 def _step_back() -> None:
@@ -154,7 +182,7 @@ def _end(turns: Turns, films: Films | None) -> None:
 
 
 @contextmanager
-def serving(server: ViewServer) -> Iterator[ViewServer]:
+def serving(server: Served) -> Iterator[Served]:
     """A server that answers, from a thread of its own, as long as the block lasts."""
     thread = threading.Thread(target=server.serve, name="view", daemon=True)
     thread.start()
@@ -185,18 +213,22 @@ def view(options: ViewOptions) -> None:
     live = read_live(Run(options.run))
     shown = Watch(options.run) if live is not None and live.is_going_on else studio()
     server = ViewServer(shown, guard, options.port, options.out)
-    warnings, lines = greeting(server, options.port)
-    for line in warnings:
-        print(line, file=sys.stderr)
-    for line in lines:
-        print(line, flush=True)
+    greet(server, options.port)
+    with stopping() as is_stopped, serving(server):
+        print("Ctrl-C ends it", flush=True)
+        keep_serving(server, shown, studio, is_stopped)
+
+
+@contextmanager
+def stopping() -> Iterator[Callable[[], bool]]:
+    """Whether SIGINT or SIGTERM has come, as long as the block lasts; for the main thread.
+
+    An exception out of a signal can be lost wherever Python swallows exceptions.
+    """
     is_stopped: list[int] = []
     before = [signal.signal(kind, lambda *_: is_stopped.append(1)) for kind in _STOPPING]
     try:
-        with serving(server):
-            print("Ctrl-C ends it", flush=True)
-            # An exception out of a signal can be lost wherever Python swallows exceptions.
-            keep_serving(server, shown, studio, lambda: bool(is_stopped))
+        yield lambda: bool(is_stopped)
     finally:
         for kind, handler in zip(_STOPPING, before, strict=True):
             signal.signal(kind, handler)
@@ -246,7 +278,16 @@ def keep_serving(
         time.sleep(0.1)
 
 
-def greeting(server: ViewServer, wanted_port: int) -> tuple[list[str], list[str]]:
+def greet(server: PageServer, wanted_port: int) -> None:
+    """Prints where the page is; warnings to standard error."""
+    warnings, lines = greeting(server, wanted_port)
+    for line in warnings:
+        print(line, file=sys.stderr)
+    for line in lines:
+        print(line, flush=True)
+
+
+def greeting(server: PageServer, wanted_port: int) -> tuple[list[str], list[str]]:
     """Warnings, and where the page is."""
     warnings = []
     if server.port != wanted_port and wanted_port:

@@ -526,7 +526,7 @@ def posed_vertices(avatar: HandAvatar, shot: Shot) -> Float[Tensor, "vertices 3"
         return avatar.personal(pose).posed(pose).vertices
 
 
-def encoded(pixels: Pixels, kind: str) -> bytes:
+def encoded(pixels: UInt8[np.ndarray, "height width 3"], kind: str) -> bytes:
     """A picture file: ``PNG`` without loss, or ``JPEG`` at once."""
     buffer = io.BytesIO()
     options = {"quality": 92} if kind == "JPEG" else {}
