@@ -110,7 +110,6 @@ def test_clips_are_nearer_with_a_light_each_than_with_one_for_all(
     many, one = (_appearance_of(folder, cues, 80) for folder in (two_clips, erased))
     assert (many.num_lights, one.num_lights) == (2, 1)
     (color, albedo), (color_of_one, albedo_of_one) = _errors(many, two_clips), _errors(one, erased)
-    print(cues.name, color, color_of_one, color_of_one / color, albedo, albedo_of_one)
     assert color_of_one > 3 * color
     assert albedo_of_one > 1.5 * albedo
 
