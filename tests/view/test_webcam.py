@@ -163,6 +163,7 @@ def test_pictures_that_are_none_are_refused(
     for wrong in ("/look", "/look?client=me", "/look?client=me&order=x&time=1"):
         assert status(wrong, good) == 400
     assert status("/look?client=me&order=1&time=nan", good) == 400
+    assert status("/look?" + "&".join(f"a{n}=1" for n in range(20)), good) == 400
     assert status("/look?client=&order=1&time=1", good) == 400
     assert status(query, good) == 200
 
