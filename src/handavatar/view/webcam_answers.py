@@ -103,8 +103,11 @@ class WebcamAnswers:
             Busy: if too many wait.
         """
         del is_gone
-        parts = urlsplit(path)
-        given = parse_qs(parts.query, max_num_fields=8)
+        try:
+            parts = urlsplit(path)
+            given = parse_qs(parts.query, max_num_fields=8)
+        except ValueError as error:
+            raise SceneError("this address means nothing") from error
         query = {name: values[0] for name, values in given.items()}
         if parts.path == "/look":
             return self._look(body, query)

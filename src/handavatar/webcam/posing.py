@@ -43,7 +43,10 @@ from handavatar.jobs.threads import one_thread
 from handavatar.tracker.points import TrackedPoints
 from handavatar.webcam.following import FollowedHand
 
-_STEPS, _STEPS_AT_FIRST = 1, 8
+_STEPS, _STEPS_AT_FIRST = 4, 8
+"""At most, of a pose that is followed and of one that is begun."""
+_SETTLED = 0.08
+"""Radians: a step that turns no joint further is the last one."""
 _BEGINNINGS = ("relaxed", "spread", "fist")
 """Gestures from which a pose of which nothing is known is begun; the best end counts."""
 _DAMPING, _FURTHER, _BACK = 1e-2, 0.25, 6.0
@@ -222,7 +225,7 @@ class PoseFollower:
     ) -> tuple[HandPose, float]:
         """A pose near another, as the sigmas say, and the energy before the last step.
 
-        The last step is taken as it is: what it did shows in the next picture.
+        A small step, and the last one, is taken as it is: what it did shows in the next picture.
         """
         information = sigmas**-2
 
@@ -244,9 +247,10 @@ class PoseFollower:
         for step in range(steps):
             damped = hessian + damping * torch.diag(hessian.diagonal())
             change = -torch.linalg.solve(damped, gradient)
-            change = change * min(1.0, _LONGEST_TURN / max(float(change[:-3].abs().max()), 1e-9))
+            longest = float(change[:-3].abs().max())
+            change = change * min(1.0, _LONGEST_TURN / max(longest, 1e-9))
             candidate = moved_pose(pose, change)
-            if step == steps - 1:
+            if step == steps - 1 or longest < _SETTLED:
                 return candidate, energy
             found = linearised(candidate)
             if found[2] < energy:
