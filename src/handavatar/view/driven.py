@@ -34,7 +34,7 @@ class DrivenAvatar:
         Args:
             avatar: read only; its own edit is applied.
         """
-        view = avatar.info.get("view")
+        view = avatar.view()
         self._baked = BakedAvatar(copy.copy(avatar), start_of(view))
         self._camera_from_world = (
             torch.eye(4) if view is None else torch.tensor(view["camera_from_world"])
