@@ -16,6 +16,7 @@ from handavatar.capture.motion_files.conversion import motion_of_file
 from handavatar.capture.motion_files.stored import is_motion_file
 from handavatar.capture.motion_files.track import Conventions, LayoutName
 from handavatar.capture.motion_files.trackers import is_hawor
+from handavatar.capture.tracking import has_mediapipe
 from handavatar.capture.video import VideoOptions, capture_video
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.rigs import load_rig
@@ -94,7 +95,15 @@ def motion_from(
         out = options.keep or Path(aside) / "capture"
         # For a motion ten pictures a second are few.
         fps = options.fps or 30.0
-        asked = VideoOptions(options.source, out, fps=fps, max_frames=MAX_STEPS, rig=options.rig)
+        asked = VideoOptions(
+            options.source,
+            out,
+            fps=fps,
+            max_frames=MAX_STEPS,
+            # Depths matter here more than pictures.
+            tracker="both" if has_mediapipe() else "auto",
+            rig=options.rig,
+        )
         capture = capture_video(asked, progress=progress)
         return motion_of_capture(capture, options.fps, tell)
 

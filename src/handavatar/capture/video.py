@@ -86,7 +86,7 @@ class VideoOptions:
     OUT-left and OUT-right."""
     tracker: TrackerChoice = "auto"
     """Who finds the hand and tells where its landmarks are: our own tracker, mediapipe, or both,
-    mediapipe finding the hand; auto: both where mediapipe is installed, else our own."""
+    mediapipe finding the hand; auto: mediapipe where it is installed, else our own."""
     masks: tuple[Path, ...] = ()
     """Masks of the hand, white on black, for each of the videos: a folder or pattern of pictures,
     or a video. They are believed; without them they are found."""
@@ -408,7 +408,7 @@ def _tracked_clip(
         track = _without(track, is_known)
     if pinhole is not None:
         track = track.with_principal_point(pinhole.principal_point)
-    if track.is_own or options.tracker != "mediapipe":
+    if track.is_own or options.tracker == "both":
         track = see_skin(track, rig)
     return replace(
         clip_of(track),
