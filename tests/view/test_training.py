@@ -307,7 +307,7 @@ def server(trainer: Trainer, tmp_path: Path) -> Iterator[ViewServer]:
         yield running
 
 
-def test_the_page_and_what_it_asks_for(server: ViewServer) -> None:
+def test_the_page_and_what_it_asks_for(without_rests: None, server: ViewServer) -> None:
     status, page = ask(server.port, "/")
     assert status == 200 and b"training.js" in page
     assert ask(server.port, "/training.js")[0] == ask(server.port, "/page.css")[0] == 200
