@@ -15,8 +15,8 @@ EXACTLY = {
     ),
     "geometry.rotations": (
         "apply_rigid axis_angle_from_matrix invert_rigid left_jacobian matrix_from_axis_angle "
-        "matrix_from_quaternion mean_rotation nearest_rotations quaternion_from_matrix "
-        "rigid_transform rotations_between skew"
+        "matrix_from_quaternion mean_rotation mirror_rigid nearest_rotations "
+        "quaternion_from_matrix rigid_transform rotations_between skew"
     ),
     "hand.pose": (
         "BONE_NAMES BONE_PARENTS CONNECTED_PAIRS FINGER_BONES HandPose NUM_BONES "

@@ -15,7 +15,6 @@ from handavatar.capture.clips import (
     clip_of,
     lay_hand,
     one_after_the_other,
-    world_pose,
 )
 from handavatar.capture.fitted_hand import HandModel
 from handavatar.capture.fitting import FitOptions
@@ -84,9 +83,9 @@ def test_poses_of_a_moving_camera_are_in_the_world() -> None:
     for number in range(3):
         seen = laid[1].fitted.vertices[number]
         assert torch.allclose(seen, laid[0].fitted.vertices[number], atol=2e-3)
-        alone = world_pose(laid[0], number, rig)
+        alone = laid[0].world.pose(number)
         assert torch.equal(alone.translation, laid[0].fitted.fit.translation[number])
-        posed = hand.posed(world_pose(laid[1], number, rig)).vertices
+        posed = hand.posed(laid[1].world.pose(number)).vertices
         expected = hand.posed(alone).vertices
         assert torch.allclose(apply_rigid(cameras[number], posed), expected, atol=2e-3)
 

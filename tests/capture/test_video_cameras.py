@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from handavatar.capture.camera_path import in_metres, metres_of_unit, mirror_cameras
+from handavatar.capture.camera_path import in_metres, metres_of_unit
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.frames import opencv_from_opengl
 from handavatar.capture.video_cameras import Lens, pinhole_of, read_camera
@@ -16,6 +16,7 @@ from handavatar.geometry.rotations import (
     invert_rigid,
     matrix_from_axis_angle,
     matrix_from_quaternion,
+    mirror_rigid,
     quaternion_from_matrix,
     rigid_transform,
 )
@@ -241,7 +242,7 @@ def test_mirrored_cameras_see_the_mirrored_world() -> None:
     points = torch.randn(3, 7, 3, generator=torch.Generator().manual_seed(3))
     seen = apply_rigid(views, points)
     assert torch.allclose(
-        apply_rigid(mirror_cameras(views), points * mirror), seen * mirror, atol=1e-5
+        apply_rigid(mirror_rigid(views), points * mirror), seen * mirror, atol=1e-5
     )
 
 

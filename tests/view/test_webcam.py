@@ -21,7 +21,7 @@ from PIL import Image
 from handavatar.avatar import HandAvatar
 from handavatar.cli import main
 from handavatar.geometry.cameras import Camera
-from handavatar.geometry.rotations import axis_angle_from_matrix
+from handavatar.geometry.rotations import axis_angle_from_matrix, invert_rigid
 from handavatar.hand.landmarks import NUM_LANDMARKS
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
@@ -30,7 +30,7 @@ from handavatar.synthetic.truth import FilmTruth
 from handavatar.tracker.model import shipped_tracker
 from handavatar.view import recording
 from handavatar.view.connections import MOST_CAMERA_BYTES, MOST_PIECE_BYTES
-from handavatar.view.driven import DrivenAvatar, pose_in_world
+from handavatar.view.driven import DrivenAvatar
 from handavatar.view.guard import guard_of
 from handavatar.view.recording import RecordingFile
 from handavatar.view.scene import SceneError
@@ -289,7 +289,7 @@ def test_a_pose_in_the_world_is_seen_at_the_same_place(driven: DrivenAvatar) -> 
     view[:3, :3] = turn * torch.linalg.det(turn)
     view[:3, 3] = torch.tensor([0.1, -0.2, 0.5])
     pose = live_pose(driven).pose
-    moved = pose_in_world(pose, driven.hand.rest_joints[0], view)
+    moved = pose.moved_to(invert_rigid(view), driven.hand.rest_joints[0])
     world = driven.hand.posed(moved).vertices
     seen = world @ view[:3, :3].T + view[:3, 3]
     torch.testing.assert_close(seen, driven.hand.posed(pose).vertices, atol=1e-5, rtol=0)

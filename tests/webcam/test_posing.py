@@ -6,6 +6,7 @@ import torch
 
 from handavatar.capture.own_finder import SeenCrop
 from handavatar.capture.skin_points import Look
+from handavatar.capture.windows import mirror_places
 from handavatar.fit.energy import EnergyOptions, linearise_landmarks
 from handavatar.fit.kinematics import NUM_UNKNOWNS, RestPoints, moved_pose
 from handavatar.fit.landmarks import NUM_OFFSETS, LandmarkSightings, landmark_rest
@@ -20,7 +21,7 @@ from handavatar.hand.rigs import load_rig
 from handavatar.tracker.model import shipped_tracker
 from handavatar.webcam.coverage import gestures_shown
 from handavatar.webcam.following import FollowedHand
-from handavatar.webcam.posing import PoseFollower, mirrored_places
+from handavatar.webcam.posing import PoseFollower
 
 SIZE = (640, 480)
 CAMERA = Camera((640.0, 640.0), (320.0, 240.0), *SIZE, torch.eye(4))
@@ -44,7 +45,7 @@ def sighting(hand: ShapedHand, pose: HandPose, is_left: bool, is_new: bool) -> F
     points = shipped_tracker().points.positions(hand, pose)
     pixels = project(CAMERA, points)[0].double().numpy()
     if is_left:
-        pixels = mirrored_places(pixels, SIZE[0])
+        pixels = mirror_places(pixels, SIZE[0])
     size = float((points[MIDDLE_KNUCKLE] - points[0]).norm())
     depths = ((points[:, 2] - points[0, 2]) / size).double().numpy()
     error = np.full(len(points), 1.0)

@@ -4,7 +4,6 @@ Structure from motion knows a camera's way but for its scale. A hand's size is k
 camera saw it: the scale is that with which the hand moves least in the world.
 """
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -57,9 +56,3 @@ def in_metres(
     found = camera_from_world.clone()
     found[..., :3, 3] *= unit
     return found
-
-
-def mirror_cameras(camera_from_world: Float[Tensor, "frames 4 4"]) -> Float[Tensor, "frames 4 4"]:
-    """Cameras of mirrored pictures, in the mirrored world."""
-    mirror = torch.diag(camera_from_world.new_tensor([-1.0, 1.0, 1.0, 1.0]))
-    return mirror @ camera_from_world @ mirror

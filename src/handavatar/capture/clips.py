@@ -24,12 +24,12 @@ from handavatar.capture.fitting import (
 )
 from handavatar.capture.guided_masks import (
     GuidedMask,
-    WristLine,
     find_guided_mask,
     guided_by_given,
     learn_guided_colors,
+    pixels_per_metre_at,
     placed_mesh,
-    wrist_line,
+    wrist_in,
 )
 from handavatar.capture.masks import (
     HandMask,
@@ -43,13 +43,11 @@ from handavatar.capture.registration import (
     posed_vertices,
     register_hands,
     see_landmarks,
-    window_view,
 )
 from handavatar.capture.skin_points import see_points, world_places
 from handavatar.capture.tracking import Track, TrackedHand
 from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.fit.register import RegisterOptions
-from handavatar.geometry.cameras import Camera, project
 from handavatar.geometry.rotations import apply_rigid, invert_rigid
 from handavatar.hand.landmarks import NUM_LANDMARKS
 from handavatar.hand.pose import HandPose
@@ -107,10 +105,6 @@ class Clip:
             raise ValueError("the cameras' unit is not known yet")
         return in_metres(self.camera_from_world, self.unit)
 
-    def starting(self, start: float) -> "Clip":
-        """The same at another time."""
-        return replace(self, start=start)
-
 
 @dataclass(frozen=True, eq=False)
 class FittedHands:
@@ -139,11 +133,13 @@ class LaidClip:
     Attributes:
         clip: the recording; the unit of its cameras is known.
         fitted: the hand.
+        world: its fit with the poses in the world's axes.
         masks: found with the hand's help, or those that the user gives.
     """
 
     clip: Clip
     fitted: FittedHands
+    world: HandFit
     masks: list[GuidedMask]
 
 
@@ -158,7 +154,7 @@ def one_after_the_other(clips: Sequence[Clip]) -> list[Clip]:
     found: list[Clip] = []
     start = 0.0
     for clip in clips:
-        found.append(clip.starting(start))
+        found.append(replace(clip, start=start))
         last = max((glance.time for glance in clip.track.glances), default=0.0)
         start += max([last, *(hand.time for hand in clip.track.hands)]) + _PAUSE
     return found
@@ -217,7 +213,10 @@ def lay_hand(
         replace(register, is_wide=False, tilts=(), restarts=0),
         lambda share: report(0.75 + 0.15 * share, "laying the hand onto masks and texture"),
     )
-    return [LaidClip(*parts) for parts in zip(clips, fitted, guided, strict=True)]
+    return [
+        LaidClip(clip, hands, _in_world(hands.fit, clip, rig), masks)
+        for clip, hands, masks in zip(clips, fitted, guided, strict=True)
+    ]
 
 
 def _parts(report: Progress, first: float, last: float, clips: Sequence[Clip]) -> list[Progress]:
@@ -395,8 +394,7 @@ def _registered(
     report: Callable[[float], None],
 ) -> list[FittedHands]:
     """The hand laid onto landmarks, masks and texture: the one place that knows how."""
-    observations, poses = [], []
-    wrist = rig.shaped(before[0].fit.shape_coefficients).rest_joints[0]
+    observations, fits = [], []
     for clip, of_clip, hands, is_known in zip(clips, masks, before, known, strict=True):
         observations += observe_hands(
             clip.track.hands,
@@ -408,16 +406,15 @@ def _registered(
             clip.world_cameras,
             clip.start,
         )
-        poses.append(_in_world(HandPose(hands.fit.rotations, hands.fit.translation), clip, wrist))
+        fits.append(_in_world(hands.fit, clip, rig))
     whole = replace(
-        before[0].fit,
-        rotations=torch.cat([pose.rotations for pose in poses]),
-        translation=torch.cat([pose.translation for pose in poses]),
+        fits[0],
+        rotations=torch.cat([fit.rotations for fit in fits]),
+        translation=torch.cat([fit.translation for fit in fits]),
     )
     fit, registered = register_hands(rig, whole, observations, options, report)
     covariances = torch.linalg.inv(registered.information.double()).float()
     vertices = posed_vertices(registered)
-    # As those have it who read the pose: without what is personal beyond the coefficients.
     wrist = rig.shaped(fit.shape_coefficients).rest_joints[0]
     found, first = [], 0
     for clip, hands in zip(clips, before, strict=True):
@@ -437,26 +434,15 @@ def _registered(
     return found
 
 
-def _in_world(pose: HandPose, clip: Clip, wrist: Float[Tensor, "3"]) -> HandPose:
-    """Poses in camera axes, in the world's."""
+def _in_world(fit: HandFit, clip: Clip, rig: Rig) -> HandFit:
+    """A fit in camera axes, in the world's."""
     cameras = clip.world_cameras
-    return pose if cameras is None else pose.moved_to(invert_rigid(cameras), wrist)
-
-
-def world_pose(laid: LaidClip, number: int, rig: Rig) -> HandPose:
-    """The pose in one picture, in the world's axes.
-
-    Args:
-        laid: the recording.
-        number: of the hand.
-        rig: that was laid onto it.
-    """
-    pose = laid.fitted.fit.pose(number)
-    cameras = laid.clip.world_cameras
     if cameras is None:
-        return pose
-    wrist = rig.shaped(laid.fitted.fit.shape_coefficients).rest_joints[0]
-    return pose.moved_to(invert_rigid(cameras[number]), wrist)
+        return fit
+    # As those have it who read the pose: without what is personal beyond the coefficients.
+    wrist = rig.shaped(fit.shape_coefficients).rest_joints[0]
+    pose = HandPose(fit.rotations, fit.translation).moved_to(invert_rigid(cameras), wrist)
+    return replace(fit, rotations=pose.rotations, translation=pose.translation)
 
 
 def _judged_fit(
@@ -474,21 +460,8 @@ def _known_before_wrist(clip: Clip, fitted: FittedHands, rig: Rig) -> list[Bool[
     """Pixels of the camera's picture in front of the wrist: what lies behind is the forearm's."""
     found = []
     for hand, vertices in zip(clip.track.hands, fitted.vertices, strict=True):
-        view = window_view(hand, fitted.fit.focal)
-        line = wrist_in(view, rig, vertices)
-        margin = _WRIST_MARGIN * view.focal[0] / max(float(vertices[:, 2].median()), 0.02)
-        before = line.before_pixels(view.width) > margin
+        view = hand.window.camera(fitted.fit.focal)
+        margin = _WRIST_MARGIN * pixels_per_metre_at(view, vertices)
+        before = wrist_in(view, rig, vertices).before_pixels(view.width) > margin
         found.append(before & inside_picture(hand.window))
     return found
-
-
-def wrist_in(camera: Camera, rig: Rig, vertices: Float[Tensor, "vertices 3"]) -> WristLine:
-    """Where the fitted hand ends, in a view of it.
-
-    Args:
-        camera: the view, in its own axes.
-        rig: whose vertices they are.
-        vertices: metres, camera axes.
-    """
-    places = project(camera, vertices)[0].double().numpy()
-    return wrist_line(places[rig.rim.numpy()], places.mean(0))

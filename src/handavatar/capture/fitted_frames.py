@@ -8,9 +8,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from handavatar.capture.clips import LaidClip, world_pose, wrist_in
+from handavatar.capture.clips import LaidClip
 from handavatar.capture.frames import Frame
-from handavatar.capture.guided_masks import GuidedMask, cut_at_wrist, is_cut_unsure
+from handavatar.capture.guided_masks import (
+    GuidedMask,
+    cut_at_wrist,
+    is_cut_unsure,
+    pixels_per_metre_at,
+    wrist_in,
+)
 from handavatar.capture.left_out import LeftOut
 from handavatar.capture.masks import (
     covered_shares,
@@ -155,7 +161,7 @@ def crop_frame(
     fine_camera = camera.resized(samples * size, samples * size)
     mesh = covered_shares(silhouette(rig, vertices, fine_camera), samples)
     line = wrist_in(camera, rig, vertices)
-    scale = camera.focal[0] / max(float(vertices[:, 2].median()), 0.02)
+    scale = pixels_per_metre_at(camera, vertices)
     cut = cut_at_wrist(shares, line)
     is_end = is_cut_unsure(mesh > 0.5, line, scale)
     counted = was_seen & ~is_end
@@ -172,7 +178,7 @@ def crop_frame(
         image=torch.from_numpy(image),
         coverage=torch.from_numpy((255 * cut * known).round().astype(np.uint8)),
         camera=camera if cameras is None else replace(camera, camera_from_world=cameras[number]),
-        pose=world_pose(laid, number, rig),
+        pose=laid.world.pose(number),
         confidence=float(np.prod(list(factors.values()))),
         split="train",
         time=laid.clip.start + hand.time,

@@ -68,6 +68,8 @@ FITTED_SIDE = 256
 """Pixels along a side of the pictures that hands are laid onto, learned from and judged; larger
 ones are binned towards it (:meth:`Frame.binned`)."""
 _UNKNOWN_GREY = 128
+PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+"""Of nerfstudio's ``camera_model``: pinholes, with or without a lens that bends lines."""
 COVARIANCES = "covariances.safetensors"
 """File of a capture: tensor ``covariance``, one matrix per frame, in the order of the frames."""
 LANDMARKS = "landmarks.safetensors"
@@ -514,7 +516,7 @@ def _header(content: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(coefficients, list) or len(coefficients) > 1000:
         raise CaptureError("shape_coefficients is not a short list", "leave it out if unknown")
     model = content.get("camera_model", "OPENCV")
-    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
+    if model not in PINHOLE_MODELS:
         raise CaptureError(f"camera_model is {str(model)[:40]!r}", "undistort to a pinhole camera")
     return {
         "rig_name": text_field(rig, "name"),
@@ -610,14 +612,7 @@ def _camera(entry: dict[str, Any], size: tuple[int, int]) -> Camera:
             raise CaptureError(
                 f"{name} is {str(entry[name])[:20]}, the picture has {length}", f"correct {name}"
             )
-    matrix = numbers(entry.get("transform_matrix"), (4, 4), "transform_matrix")
-    rotation = matrix[:3, :3]
-    is_rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
-    if not is_rigid or np.linalg.det(rotation) < 0 or list(matrix[3]) != [0, 0, 0, 1]:
-        raise CaptureError(
-            "transform_matrix is not a rotation and a translation",
-            "its upper left 3 x 3 must be orthonormal, its last row 0 0 0 1",
-        )
+    matrix = read_transform(entry.get("transform_matrix"), "transform_matrix")
     return Camera(
         focal=(
             number(entry.get("fl_x"), "fl_x", 1e-3, 1e6),
@@ -631,6 +626,27 @@ def _camera(entry: dict[str, Any], size: tuple[int, int]) -> Camera:
         height=size[1],
         camera_from_world=opencv_from_opengl(matrix),
     )
+
+
+def read_transform(value: object, label: str) -> np.ndarray:
+    """A rigid matrix of 4 x 4.
+
+    Args:
+        value: nested lists, as JSON has them.
+        label: what it is, for the message.
+
+    Raises:
+        CaptureError: it is none.
+    """
+    matrix = numbers(value, (4, 4), label)
+    rotation = matrix[:3, :3]
+    is_rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-3
+    if not is_rigid or np.linalg.det(rotation) < 0 or list(matrix[3]) != [0, 0, 0, 1]:
+        raise CaptureError(
+            f"{label} is not a rotation and a translation",
+            "its upper left 3 x 3 must be orthonormal, its last row 0 0 0 1",
+        )
+    return matrix
 
 
 def _size_of_picture(path: Path, modes: tuple[str, ...]) -> tuple[int, int]:

@@ -9,17 +9,20 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image
 
-from handavatar.capture.checks import CaptureError, decoded, picture_in
-from handavatar.capture.decoding import MAX_PIXELS, Sampling, have_same_shape, video_frames
+from handavatar.capture.checks import CaptureError, decoded
+from handavatar.capture.decoding import Sampling, have_same_shape, video_frames
 from handavatar.capture.left_out import NO_MASK
 from handavatar.capture.masks import HandMask
-from handavatar.capture.picture_folders import is_picture_source, picture_files
+from handavatar.capture.picture_folders import (
+    is_picture_source,
+    open_picture_file,
+    picture_files,
+)
 from handavatar.capture.tracking import Track, TrackedHand
 from handavatar.capture.windows import resampled
 
 # Of the landmarks, that lie in the masks of half of the pictures.
 _LEAST_INSIDE = 0.6
-_KINDS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")
 Straighten = Callable[[UInt8[np.ndarray, "height width 3"]], UInt8[np.ndarray, "_ _ 3"]]
 """Makes a pinhole's picture of one of a lens."""
 
@@ -118,7 +121,7 @@ def _by_number(files: list[Path], masks: Path, last: int) -> dict[int, Path]:
 
 def _read(file: Path) -> UInt8[np.ndarray, "height width 3"]:
     """A mask as 0 and 255, whatever its levels."""
-    picture = picture_in(file, str(file), _KINDS, MAX_PIXELS)
+    picture = open_picture_file(file)
     if picture.mode in ("RGBA", "LA"):
         picture = picture.getchannel("A")
     elif picture.mode == "P":

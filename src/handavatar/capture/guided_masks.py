@@ -37,7 +37,7 @@ from handavatar.capture.masks import (
 )
 from handavatar.capture.outlines import silhouette
 from handavatar.capture.tracking import TrackedHand
-from handavatar.geometry.cameras import project
+from handavatar.geometry.cameras import Camera, project
 from handavatar.hand.rig import Rig
 
 # Metres. Farther from the mesh nothing is hand; so deep inside colours are learned as skin.
@@ -102,6 +102,28 @@ def wrist_line(rim: Float[np.ndarray, "rim 2"], hand: Float[np.ndarray, "2"]) ->
     return WristLine(center, direction / np.linalg.norm(direction))
 
 
+def wrist_in(camera: Camera, rig: Rig, vertices: Float[Tensor, "vertices 3"]) -> WristLine:
+    """Where the fitted hand ends, in a view of it.
+
+    Args:
+        camera: the view, in its own axes.
+        rig: whose vertices they are.
+        vertices: metres, camera axes.
+    """
+    places = project(camera, vertices)[0].double().numpy()
+    return wrist_line(places[rig.rim.numpy()], places.mean(0))
+
+
+def pixels_per_metre_at(camera: Camera, vertices: Float[Tensor, "vertices 3"]) -> float:
+    """Scale of a view at a fitted hand.
+
+    Args:
+        camera: the view, in its own axes.
+        vertices: metres, camera axes.
+    """
+    return camera.focal[0] / max(float(vertices[:, 2].median()), 0.02)
+
+
 @dataclass(frozen=True, eq=False)
 class PlacedMesh:
     """The fitted hand in one window.
@@ -128,12 +150,12 @@ def placed_mesh(
         focal: of the whole picture, pixels.
         hand: whose window is meant.
     """
-    window = hand.window
-    camera = window.camera(focal)
-    places = project(camera, vertices)[0].double().numpy()
-    scale = camera.focal[0] / max(float(vertices[:, 2].median()), 0.02)
-    line = wrist_line(places[rig.rim.numpy()], places.mean(0))
-    return PlacedMesh(silhouette(rig, vertices, camera), line, scale)
+    camera = hand.window.camera(focal)
+    return PlacedMesh(
+        silhouette(rig, vertices, camera),
+        wrist_in(camera, rig, vertices),
+        pixels_per_metre_at(camera, vertices),
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -143,7 +143,12 @@ def _natural_order(name: str) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdigit() else (0, part) for part in parts]
 
 
-def _opened(file: Path) -> Image.Image:
+def open_picture_file(file: Path) -> Image.Image:
+    """A picture of any kind that is read here; no pixel is decoded yet.
+
+    Raises:
+        CaptureError: it is damaged or too large, or needs a package that is not installed.
+    """
     suffix = file.suffix.lower()
     if suffix in _OPTIONAL:
         try:
@@ -160,7 +165,7 @@ def _opened(file: Path) -> Image.Image:
 
 
 def _upright_size(file: Path) -> tuple[int, int]:
-    with _opened(file) as picture:
+    with open_picture_file(file) as picture:
         width, height = picture.size
         check_size(file, width, height)
         is_turned = picture.getexif().get(0x0112) in (5, 6, 7, 8)
@@ -168,7 +173,7 @@ def _upright_size(file: Path) -> tuple[int, int]:
 
 
 def _read(file: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 3"]:
-    picture = _opened(file)
+    picture = open_picture_file(file)
     try:
         profile = picture.info.get("icc_profile")
         if picture.mode.startswith(("I", "F")):

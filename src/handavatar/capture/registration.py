@@ -22,7 +22,6 @@ from handavatar.fit.energy import Observation
 from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.fit.pictures import FramePicture
 from handavatar.fit.register import Registered, RegisterOptions, register
-from handavatar.geometry.cameras import Camera
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.rig import Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
@@ -35,11 +34,6 @@ _PLACE_ERROR = 0.05
 """Metres."""
 _COMPARED_SIDE = 224
 """Pixels of the hand's surroundings that the fit looks at: 1.5 to 2 mm each."""
-
-
-def window_view(hand: TrackedHand, focal: float) -> Camera:
-    """The camera of a tracked hand's window; focal length in pixels of the whole picture."""
-    return hand.window.camera(focal)
 
 
 def see_landmarks(seen: Observations, fit: HandFit) -> list[LandmarkSightings]:
@@ -104,7 +98,7 @@ def observe_hands(
         full = hand.window.image.shape[0]
         side = min(_COMPARED_SIDE, full)
         zoom = np.eye(2) * (full / side)
-        view = window_view(hand, focal).resized(side, side)
+        view = hand.window.camera(focal).resized(side, side)
         picture = FramePicture.of(
             view
             if camera_from_world is None

@@ -19,7 +19,14 @@ from PIL import Image
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import VideoFrame
 from handavatar.capture.skin_points import SeenPoints
-from handavatar.capture.windows import FINE_SIDE, MASK_SIDE, Window, resampled, window_around
+from handavatar.capture.windows import (
+    FINE_SIDE,
+    MASK_SIDE,
+    Window,
+    mirror_places,
+    resampled,
+    window_around,
+)
 
 LANDMARK_NAMES: tuple[str, ...] = (
     "wrist",
@@ -40,8 +47,8 @@ _SIDE_WINDOW, _MIN_AGAINST, _AGAINST_SHARE = 0.6, 4, 0.8
 _CLEAR_VOTE = 0.3
 _MIN_FRAMES = 8
 _GLANCE_SIDE = 160
-# Of the picture's brightness, 0 to 255: below, a camera sees noise rather than skin.
-_DARK = 30.0
+DARK = 30.0
+"""Of a picture's brightness, 0 to 255: below, a camera sees noise rather than skin."""
 # Between two pictures, in units of its size: as far does a hand that is followed move.
 _FARTHEST_STEP = 0.6
 TWO_HANDS, NO_HAND, OTHER_HAND = "two hands", "no hand found", "the other hand"
@@ -109,13 +116,11 @@ class TrackedHand:
 
     def mirrored(self) -> "TrackedHand":
         """The same hand in the mirrored picture."""
-        flip = np.array([-1.0, 1.0])
-        shift = np.array([self.window.picture_size[0], 0.0])
         return replace(
             self,
             window=self.window.mirrored(),
             fine=None if self.fine is None else self.fine.mirrored(),
-            landmarks=self.landmarks * flip + shift,
+            landmarks=mirror_places(self.landmarks, self.window.picture_size[0]),
             world_landmarks=self.world_landmarks * np.array([-1.0, 1.0, 1.0]),
         )
 
@@ -550,7 +555,7 @@ def _check_found(track: Track) -> None:
             "are needed"
         )
         brightness = [float(glance.image.mean()) for glance in track.glances]
-        if brightness and float(np.median(brightness)) < _DARK:
+        if brightness and float(np.median(brightness)) < DARK:
             raise UnusableTrackError(
                 f"{found}; the pictures are too dark (mean {np.median(brightness):.0f} of 255)",
                 "record in more light",

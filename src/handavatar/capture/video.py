@@ -8,7 +8,6 @@ from typing import Literal
 import torch
 from safetensors.torch import save_file
 
-from handavatar.capture.camera_path import mirror_cameras
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.clip_gains import match_clips
 from handavatar.capture.clips import (
@@ -52,6 +51,7 @@ from handavatar.capture.video_report import (
 )
 from handavatar.fit.energy import VIDEO_TEXTURE_SHARE, EnergyOptions
 from handavatar.fit.register import RegisterOptions
+from handavatar.geometry.rotations import mirror_rigid
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import files_named
@@ -380,7 +380,8 @@ def _tracked_clip(
     track: Track | None,
 ) -> Clip:
     """One recording, with all that the user says of it."""
-    if camera is not None and camera.camera_from_world and not is_picture_source(options.file):
+    has_moved = camera is not None and bool(camera.camera_from_world)
+    if has_moved and not is_picture_source(options.file):
         raise CaptureError(
             f"{options.camera[0]}: it says where the camera was in each picture by its name, and "
             f"the pictures of {options.file.name} have none",
@@ -389,6 +390,8 @@ def _tracked_clip(
         )
     found = _Tracked(track, {}, None) if track else _tracked(options, camera, progress)
     track, pinhole = found.track, found.pinhole
+    if camera is not None and has_moved:
+        track = _of_known_cameras(track, found.names, camera)
     masks = None
     if options.masks:
         track, masks = give_masks(
@@ -399,13 +402,12 @@ def _tracked_clip(
             pinhole.straighten if pinhole else lambda image: image,
         )
     views = None
-    if camera is not None and camera.camera_from_world:
-        names = [found.names.get(hand.index, "") for hand in track.hands]
-        is_known = [name in camera.camera_from_world for name in names]
-        if masks is not None:
-            masks = [mask for mask, known in zip(masks, is_known, strict=True) if known]
-        views = _views(camera, [name for name in names if name in camera.camera_from_world], track)
-        track = _without(track, is_known)
+    if camera is not None and has_moved:
+        views = torch.stack(
+            [camera.camera_from_world[found.names[hand.index]] for hand in track.hands]
+        )
+        # Left hands were mirrored, and so is their world.
+        views = mirror_rigid(views) if track.side == "left" else views
     if pinhole is not None:
         track = track.with_principal_point(pinhole.principal_point)
     if track.is_own or options.tracker == "both":
@@ -419,21 +421,17 @@ def _tracked_clip(
     )
 
 
-def _views(camera: KnownCamera, names: Sequence[str], track: Track) -> torch.Tensor:
-    """Of the pictures that are named; mirrored where the pictures are."""
-    if not names:
-        known = len(camera.camera_from_world)
+def _of_known_cameras(track: Track, names: dict[int, str], camera: KnownCamera) -> Track:
+    """The pictures whose camera is known; the others are skipped by that name."""
+    known = {
+        hand.index for hand in track.hands if names.get(hand.index) in camera.camera_from_world
+    }
+    if not known:
         raise CaptureError(
-            f"{camera.source}: none of its {known} cameras has the name of a picture",
+            f"{camera.source}: none of its {len(camera.camera_from_world)} cameras has the name of "
+            "a picture",
             "give the folder of the pictures that the cameras were found for",
         )
-    views = torch.stack([camera.camera_from_world[name] for name in names])
-    return mirror_cameras(views) if track.side == "left" else views
-
-
-def _without(track: Track, is_known: Sequence[bool]) -> Track:
-    """The pictures whose camera is known; the others are skipped by that name."""
-    pairs = list(zip(track.hands, is_known, strict=True))
-    lacking = {hand.index: NO_CAMERA for hand, known in pairs if not known}
-    kept = tuple(hand for hand, known in pairs if known)
+    lacking = {hand.index: NO_CAMERA for hand in track.hands if hand.index not in known}
+    kept = tuple(hand for hand in track.hands if hand.index in known)
     return replace(track, hands=kept, skipped=track.skipped | lacking)

@@ -6,7 +6,7 @@ looks at them, so that all that follows knows pinholes alone.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from handavatar.capture.checks import CaptureError, load_json, number, numbers, text_field
-from handavatar.capture.decoding import Tell, VideoFrame, have_same_shape
-from handavatar.capture.frames import opencv_from_opengl
+from handavatar.capture.checks import CaptureError, load_json, number, text_field
+from handavatar.capture.decoding import Tell, have_same_shape
+from handavatar.capture.frames import PINHOLE_MODELS, opencv_from_opengl, read_transform
 from handavatar.capture.masks import load_opencv
 from handavatar.geometry.rotations import matrix_from_quaternion, rigid_transform
 
@@ -129,7 +129,7 @@ def read_camera(path: Path) -> KnownCamera:
 def _from_transforms(file: Path) -> KnownCamera:
     content = load_json(file)
     model = content.get("camera_model", "OPENCV")
-    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE"):
+    if model not in PINHOLE_MODELS:
         raise CaptureError(f"camera_model is {str(model)[:40]!r}", _UNDISTORT)
     entries = content.get("frames", [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
@@ -144,8 +144,9 @@ def _from_transforms(file: Path) -> KnownCamera:
         if "transform_matrix" not in entry:
             continue
         name = Path(text_field(entry, "file_path")).name
-        matrix = numbers(entry["transform_matrix"], (4, 4), f"transform_matrix of frame #{index}")
-        _add_view(views, name, opencv_from_opengl(_rigid(matrix, f"frame #{index} ({name})")))
+        label = f"transform_matrix of frame #{index} ({name})"
+        matrix = read_transform(entry["transform_matrix"], label)
+        _add_view(views, name, opencv_from_opengl(matrix))
     return KnownCamera(lenses.pop(), file.name, views)
 
 
@@ -167,17 +168,6 @@ def _lens_of(content: dict[str, Any]) -> Lens:
         (number(content.get("k1", 0.0), "k1"), number(content.get("k2", 0.0), "k2")),
         (number(content.get("p1", 0.0), "p1"), number(content.get("p2", 0.0), "p2")),
     )
-
-
-def _rigid(matrix: np.ndarray, label: str) -> np.ndarray:
-    """A matrix that turns and moves, its scale (if there is one) taken from its axes."""
-    turn = matrix[:3, :3]
-    if np.abs(turn @ turn.T - np.eye(3)).max() > 1e-3 or np.linalg.det(turn) < 0:
-        raise CaptureError(
-            f"{label}: its matrix is not a rotation and a translation",
-            "its upper left 3 x 3 must be orthonormal",
-        )
-    return matrix
 
 
 def _add_view(views: dict[str, Float[Tensor, "4 4"]], name: str, view: Tensor) -> None:
@@ -311,22 +301,6 @@ def pinhole_of(lens: Lens, size: tuple[int, int], where: str, tell: Tell) -> Pin
         return opencv.remap(image, *maps, opencv.INTER_CUBIC, borderMode=opencv.BORDER_REPLICATE)
 
     return Pinhole(focal * zoom, lens.center, straighten)
-
-
-def straightened(
-    frames: Iterable[VideoFrame], pinhole: Callable[[tuple[int, int]], Pinhole]
-) -> Iterator[VideoFrame]:
-    """Frames as a pinhole sees them.
-
-    Args:
-        frames: of the lens, all of one size.
-        pinhole: of pictures of a width and height.
-    """
-    found: Pinhole | None = None
-    for frame in frames:
-        if found is None:
-            found = pinhole((frame.image.shape[1], frame.image.shape[0]))
-        yield replace(frame, image=found.straighten(frame.image))
 
 
 def _pixel_centers(size: tuple[int, int]) -> Float[np.ndarray, "height width 2"]:

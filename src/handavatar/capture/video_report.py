@@ -16,12 +16,10 @@ from handavatar.capture.frames import SPLITS, Frame
 from handavatar.capture.left_out import CAUSES, LeftOut
 from handavatar.capture.overview import Tile, contact_sheet, outlined
 from handavatar.capture.seen_skin import SeenSkin
-from handavatar.capture.tracking import NO_HAND, Track
+from handavatar.capture.tracking import DARK, NO_HAND, Track
 from handavatar.jobs.files import FolderKind, mark_folder
 
 _HELD_OUT = ((0.28, 0.08), (0.68, 0.08))
-# Of a video's pictures, 0 to 255.
-_DARK = 30.0
 # Of the mesh: as much of it beyond the picture is contact with the border.
 _TOUCHES = 0.01
 # Of the tracker's votes for one side.
@@ -139,7 +137,7 @@ def too_few(clips: Sequence[TriedClip], num_kept: int) -> tuple[str, str]:
     kind, count = kinds.most_common(1)[0]
     brightness = [float(glance.image.mean()) for clip in clips for glance in clip.track.glances]
     votes = float(np.mean([clip.track.votes_right for clip in clips]))
-    if kind in ("pose", NO_HAND) and brightness and float(np.median(brightness)) < _DARK:
+    if kind in ("pose", NO_HAND) and brightness and float(np.median(brightness)) < DARK:
         kind = "dark"
     elif kind == "pose" and 1 - _CLEAR_VOTE < votes < _CLEAR_VOTE:
         kind = "side"

@@ -72,6 +72,18 @@ class Window:
         return window_camera(focal, self.principal_point, self.corner, pixels / self.scale, pixels)
 
 
+def mirror_places(
+    places: Float[np.ndarray, "points 2"], width: int
+) -> Float[np.ndarray, "points 2"]:
+    """Pixels of a picture in its mirror image, and back.
+
+    Args:
+        places: pixels.
+        width: of the picture.
+    """
+    return places * np.array([-1.0, 1.0]) + np.array([float(width), 0.0])
+
+
 def window_camera(
     focal: float,
     principal_point: tuple[float, float],

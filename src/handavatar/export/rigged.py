@@ -4,8 +4,6 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.motion import Motion
@@ -15,7 +13,12 @@ from handavatar.export.gltf import Clip, SkinnedMesh
 from handavatar.export.skeletons import BoneNames, Skeleton, skeleton_of
 from handavatar.export.surface import rest_shape_error, split_at_seams, textured_hand
 from handavatar.geometry.meshes import vertex_normals
-from handavatar.geometry.rotations import apply_rigid, invert_rigid, rigid_transform
+from handavatar.geometry.rotations import (
+    apply_rigid,
+    invert_rigid,
+    mirror_rigid,
+    rigid_transform,
+)
 from handavatar.hand.pose import bone_transforms
 from handavatar.hand.rig import ShapedHand
 from handavatar.hand.sparse_skin import SparseSkin
@@ -84,21 +87,15 @@ def mirrored(mesh: SkinnedMesh) -> SkinnedMesh:
     flip = mesh.vertices.new_tensor(MIRROR)
     clip = mesh.clip
     if clip is not None:
-        clip = replace(clip, file_from_joint=_mirrored_rigid(clip.file_from_joint))
+        clip = replace(clip, file_from_joint=mirror_rigid(clip.file_from_joint))
     return replace(
         mesh,
         vertices=mesh.vertices * flip,
         normals=mesh.normals * flip,
         faces=mesh.faces.flip(-1),
-        file_from_joint=_mirrored_rigid(mesh.file_from_joint),
+        file_from_joint=mirror_rigid(mesh.file_from_joint),
         clip=clip,
     )
-
-
-def _mirrored_rigid(transforms: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """Mirrored before and after: a rotation stays one, and axes keep their meaning but for x."""
-    flip = transforms.new_tensor([*MIRROR, 1.0])
-    return flip[:, None] * transforms * flip
 
 
 def _clip(

@@ -188,6 +188,12 @@ def invert_rigid(transform: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batc
     return rigid_transform(rotation, translation)
 
 
+def mirror_rigid(transform: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """Rigid transforms between mirrored axes: x is turned round on both sides."""
+    flip = transform.new_tensor([-1.0, 1.0, 1.0, 1.0])
+    return flip[:, None] * transform * flip
+
+
 def apply_rigid(
     target_from_source: Float[Tensor, "*batch 4 4"], points: Float[Tensor, "*batch points 3"]
 ) -> Float[Tensor, "*batch points 3"]:

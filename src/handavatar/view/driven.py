@@ -5,14 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
-from torch import Tensor
+from jaxtyping import UInt8
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
 from handavatar.geometry.colors import eight_bits
-from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
+from handavatar.geometry.rotations import invert_rigid
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import ShapedHand
 from handavatar.jobs.threads import one_thread
@@ -39,6 +38,7 @@ class DrivenAvatar:
         self._camera_from_world = (
             torch.eye(4) if view is None else torch.tensor(view["camera_from_world"])
         )
+        self._world_from_camera = invert_rigid(self._camera_from_world)
         self._lit: HandPose | None = None
         self._pictures = 0
         self.hand: ShapedHand = avatar.base_rig.to("cpu").shaped(avatar.coefficients.cpu())
@@ -59,7 +59,7 @@ class DrivenAvatar:
         scale = longer_side / max(camera.width, camera.height)
         camera = camera.resized(round(camera.width * scale), round(camera.height * scale))
         # Light belongs to the world of the avatar's capture: the camera stands where it stood.
-        pose = pose_in_world(live.pose, self.hand.rest_joints[0], self._camera_from_world)
+        pose = live.pose.moved_to(self._world_from_camera, self.hand.rest_joints[0])
         camera = replace(camera, camera_from_world=self._camera_from_world)
         if self._lit is None or self._pictures % _LIT_EVERY == 0:
             self._lit = pose
@@ -67,19 +67,3 @@ class DrivenAvatar:
         rendering = self._baked.render(pose, camera, Edit(), self._lit)
         pixels = eight_bits(rendering.color.cpu()).numpy()
         return np.ascontiguousarray(pixels[:, ::-1]) if is_left else pixels
-
-
-def pose_in_world(
-    pose: HandPose, wrist: Float[Tensor, "3"], camera_from_world: Float[Tensor, "4 4"]
-) -> HandPose:
-    """A pose in a camera's axes, in the world of that camera.
-
-    Args:
-        pose: in camera axes.
-        wrist: the wrist's joint in the zero pose, metres.
-        camera_from_world: rigid transform.
-    """
-    rotation, shift = camera_from_world[:3, :3], camera_from_world[:3, 3]
-    turned = rotation.T @ matrix_from_axis_angle(pose.rotations[0])
-    rotations = torch.cat([axis_angle_from_matrix(turned)[None], pose.rotations[1:]])
-    return HandPose(rotations, rotation.T @ (wrist + pose.translation - shift) - wrist)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import TypeVar
 
 import torch
 
@@ -72,7 +72,49 @@ class ViewOptions:
     kernel: Kernel = "auto"
 
 
-class ViewServer:
+class PageServer:
+    """Serves a page to those whom its guard lets in."""
+
+    def __init__(self, guard: Guard, port: int) -> None:
+        """Binds the port; :meth:`serve` answers.
+
+        Args:
+            guard: who is let in, and where to listen.
+            port: the first to try; 0 is any.
+
+        Raises:
+            OSError: if no port is free, or there is no such host.
+        """
+        self._http = bound(guard.host, port)
+        self.port: int = self._http.server_address[1]
+        self.guard = replace(guard, cookie=f"{guard.cookie}-{self.port}")
+        self._http.guard = self.guard
+
+    @property
+    def address(self) -> str:
+        """What to open in a browser, the token included."""
+        host = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(
+            self.guard.host, self.guard.host
+        )
+        host = f"[{host}]" if ":" in host else host
+        query = f"?token={self.guard.token}" if self.guard.token else ""
+        return f"http://{host}:{self.port}/{query}"
+
+    def serve(self) -> None:
+        """Answers until :meth:`close` is called from another thread."""
+        self._http.serve_forever(poll_interval=0.2)
+
+    def close(self) -> None:
+        """Stops answering and frees the port."""
+        self._http.shutdown()
+        self._http.server_close()
+        self._http.hang_up()
+
+
+Served = TypeVar("Served", bound=PageServer)
+
+
+class ViewServer(PageServer):
     """The page, and what it asks for."""
 
     def __init__(self, shown: Studio | Watch, guard: Guard, port: int, out: Path) -> None:
@@ -87,10 +129,7 @@ class ViewServer:
         Raises:
             OSError: if no port is free, or there is no such host.
         """
-        self._http = bound(guard.host, port)
-        self.port: int = self._http.server_address[1]
-        self.guard = replace(guard, cookie=f"{guard.cookie}-{self.port}")
-        self._http.guard = self.guard
+        super().__init__(guard, port)
         self.out = out
         self._cores = torch.get_num_threads()
         self.turns, self.films = self._begin(shown)
@@ -120,53 +159,10 @@ class ViewServer:
         self._http.answers = AvatarAnswers(shown, turns, films, self.out)
         return turns, films
 
-    @property
-    def address(self) -> str:
-        """What to open in a browser, the token included."""
-        return address_of(self.guard, self.port)
-
-    def serve(self) -> None:
-        """Answers until :meth:`close` is called from another thread."""
-        self._http.serve_forever(poll_interval=0.2)
-
     def close(self) -> None:
         """Stops answering, drops what is being made, frees the port."""
-        self._http.shutdown()
-        self._http.server_close()
-        self._http.hang_up()
+        super().close()
         _end(self.turns, self.films)
-
-
-@runtime_checkable
-class PageServer(Protocol):
-    """What serves a page."""
-
-    guard: Guard
-    port: int
-
-    @property
-    def address(self) -> str:
-        """What to open in a browser, the token included."""
-        ...
-
-    def serve(self) -> None:
-        """Answers until :meth:`close` is called from another thread."""
-        ...
-
-    def close(self) -> None:
-        """Stops answering and frees the port."""
-        ...
-
-
-Served = TypeVar("Served", bound=PageServer)
-
-
-def address_of(guard: Guard, port: int) -> str:
-    """What to open in a browser, the token included."""
-    host = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(guard.host, guard.host)
-    host = f"[{host}]" if ":" in host else host
-    query = f"?token={guard.token}" if guard.token else ""
-    return f"http://{host}:{port}/{query}"
 
 
 def _step_back() -> None:

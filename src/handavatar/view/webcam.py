@@ -6,18 +6,17 @@ pictures that the hand is followed in are small ones of the same camera, and are
 
 import threading
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from handavatar.avatar import HandAvatar
 from handavatar.hand.rigs import load_rig
 from handavatar.tracker.model import shipped_tracker
-from handavatar.view.connections import bound
 from handavatar.view.driven import DrivenAvatar
 from handavatar.view.guard import Guard
 from handavatar.view.recording import RecordingFile
-from handavatar.view.server import address_of, checked_guard, greet, serving, stopping
+from handavatar.view.server import PageServer, checked_guard, greet, serving, stopping
 from handavatar.view.webcam_answers import WebcamAnswers
 from handavatar.webcam.session import LiveSession
 
@@ -53,7 +52,7 @@ class WebcamOptions:
     token: str = ""
 
 
-class WebcamServer:
+class WebcamServer(PageServer):
     """The page, and what it asks for."""
 
     def __init__(self, answers: WebcamAnswers, guard: Guard, port: int) -> None:
@@ -67,29 +66,15 @@ class WebcamServer:
         Raises:
             OSError: if no port is free, or there is no such host.
         """
+        super().__init__(guard, port)
         self.answers = answers
-        self._http = bound(guard.host, port)
-        self.port: int = self._http.server_address[1]
-        self.guard = replace(guard, cookie=f"{guard.cookie}-{self.port}")
-        self._http.guard = self.guard
         self._http.answers = answers
         # Two pictures on their way, a piece of a recording, and what another page may try.
         self._http.pictures = threading.BoundedSemaphore(_MOST_POSTED)
 
-    @property
-    def address(self) -> str:
-        """What to open in a browser, the token included."""
-        return address_of(self.guard, self.port)
-
-    def serve(self) -> None:
-        """Answers until :meth:`close` is called from another thread."""
-        self._http.serve_forever(poll_interval=0.2)
-
     def close(self) -> None:
         """Stops answering, removes what is not whole, frees the port."""
-        self._http.shutdown()
-        self._http.server_close()
-        self._http.hang_up()
+        super().close()
         self.answers.close()
 
 

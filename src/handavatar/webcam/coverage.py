@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from handavatar.capture.seen_skin import seen_vertices, skin_regions, vertex_areas
+from handavatar.capture.windows import window_camera
 from handavatar.geometry.cameras import Camera, framing_camera, project
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.hand.pose import FINGER_BONES, HandPose
@@ -200,14 +201,7 @@ def _camera_about(camera: Camera, vertices: Float[Tensor, "vertices 3"]) -> Came
     low, high = pixels.amin(0), pixels.amax(0)
     side = float((high - low).max()) + 2
     left, top = ((low + high) / 2 - side / 2).tolist()
-    scale = _SIDE / side
-    return Camera(
-        (camera.focal[0] * scale, camera.focal[1] * scale),
-        ((camera.center[0] - left) * scale, (camera.center[1] - top) * scale),
-        _SIDE,
-        _SIDE,
-        camera.camera_from_world,
-    )
+    return window_camera(camera.focal[0], camera.center, (left, top), side, _SIDE)
 
 
 def _inside(camera: Camera, whole: Camera) -> Bool[Tensor, "height width"]:

@@ -22,6 +22,7 @@ from handavatar.capture.fitting import (
     placed,
 )
 from handavatar.capture.skin_points import world_places
+from handavatar.capture.windows import mirror_places
 from handavatar.fit.energy import EnergyOptions, linearise_landmarks
 from handavatar.fit.habits import habit_residuals
 from handavatar.fit.kinematics import (
@@ -155,9 +156,9 @@ class PoseFollower:
         """In the mirror, if it is a left hand, in which it is a right one."""
         seen = followed.seen
         count = NUM_LANDMARKS + len(self._vertices)
-        places = seen.points[:count].copy()
+        places = seen.points[:count]
         if followed.is_mirrored:
-            places[:, 0] = size[0] - places[:, 0]
+            places = mirror_places(places, size[0])
         landmarks = places[:NUM_LANDMARKS]
         world = world_places(self._tracked, landmarks, seen.depths[:NUM_LANDMARKS])
         flat = np.linalg.norm(world[:, :2] - world[:, :2].mean(0), axis=-1).sum()
@@ -279,10 +280,3 @@ class _Observed:
 
 def _sigmas(turn: float, shift: float) -> Float[Tensor, "51"]:
     return torch.cat([torch.full((NUM_UNKNOWNS - 3,), turn), torch.full((3,), shift)])
-
-
-def mirrored_places(
-    places: Float[np.ndarray, "points 2"], width: int
-) -> Float[np.ndarray, "points 2"]:
-    """Pixels of a picture in its mirror image, and back."""
-    return places * np.array([-1.0, 1.0]) + np.array([float(width), 0.0])

@@ -9,6 +9,7 @@ from PIL import Image
 from scipy import ndimage
 
 from handavatar.capture.own_finder import SeenCrop
+from handavatar.capture.tracking import DARK
 
 Kind = Literal["none", "border", "small", "dark", "bright", "blur", "unsure"]
 ADVICE: dict[Kind, tuple[str, str]] = {
@@ -28,8 +29,6 @@ _BEYOND, _NEAR_BORDER = 0.02, 0.005
 # Of the hand's pixels by brightness, 0 to 255: nine tenths of them are darker than this, or more
 # than this share has a channel at its end.
 _DARK, _FULL, _MOST_FULL = 60.0, 250, 0.25
-# Of a whole picture's brightness: below, a camera sees noise rather than skin.
-_DARK_PICTURE = 30.0
 # Share of the picture's slopes that another blur takes away: less, and it was blurred before.
 _SHARP = 0.25
 # Pixels along the longer side of the hand at which blur is judged, at most.
@@ -97,7 +96,7 @@ def find_warnings(
 
 def warnings_without_hand(image: UInt8[np.ndarray, "height width 3"]) -> list[Warning]:
     """What is wrong with a picture in which no hand is seen."""
-    is_dark = float(image.mean()) < _DARK_PICTURE
+    is_dark = float(image.mean()) < DARK
     return [Warning("none"), *([Warning("dark")] if is_dark else [])]
 
 

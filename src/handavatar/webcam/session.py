@@ -8,13 +8,14 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from handavatar.capture.windows import mirror_places
 from handavatar.geometry.cameras import project
 from handavatar.geometry.meshes import vertex_normals
 from handavatar.hand.rig import Rig, ShapedHand
 from handavatar.jobs.threads import one_thread
 from handavatar.webcam.coverage import FINISHED, SkinCoverage, next_step
 from handavatar.webcam.following import FollowedHand, HandFollower, WhichSide
-from handavatar.webcam.posing import LivePose, PoseFollower, mirrored_places
+from handavatar.webcam.posing import LivePose, PoseFollower
 from handavatar.webcam.quality import ADVICE, Warning, find_warnings, warnings_without_hand
 
 _UNSURE = 0.12
@@ -120,7 +121,7 @@ class LiveSession:
         pixels = project(live.camera, vertices)[0].double().numpy()
         landmarks = self._poser.landmarks(live).double().numpy()
         if followed.is_mirrored:
-            pixels, landmarks = (mirrored_places(p, width) for p in (pixels, landmarks))
+            pixels, landmarks = (mirror_places(p, width) for p in (pixels, landmarks))
         is_unsure = live.misfit > _UNSURE
         warnings = find_warnings(image, followed.seen, pixels, is_unsure)
         is_counted = not {w.kind for w in warnings} & {"dark", "blur", "unsure", "small"}

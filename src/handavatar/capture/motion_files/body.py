@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from handavatar.capture.checks import CaptureError
-from handavatar.capture.motion_files.parameters import matrices_from_vectors, rate_of
+from handavatar.capture.motion_files.parameters import checked_vectors, rate_of
 from handavatar.capture.motion_files.stored import Part, array_field, rows_of
 from handavatar.capture.motion_files.track import Conventions, HandTrack, mirrored_rotations
 from handavatar.geometry.rotations import matrix_from_axis_angle
@@ -49,9 +49,8 @@ def read_amass(part: Part, conventions: Conventions) -> HandTrack:
         )
     poses = rows_of(values, (_VALUES,), "poses", part.path)
     fingers = torch.from_numpy(poses[:, _HANDS[conventions.side]].copy())
-    matrices_from_vectors(fingers, part.path)  # Refuses degrees.
     rotations = torch.eye(3, dtype=torch.float64).repeat(len(fingers), NUM_BONES, 1, 1)
-    rotations[:, 1:] = matrix_from_axis_angle(fingers.unflatten(-1, (-1, 3)))
+    rotations[:, 1:] = matrix_from_axis_angle(checked_vectors(fingers, part.path))
     if conventions.side == "left":
         rotations = mirrored_rotations(rotations)
     notes = ["AMASS: fingers alone; the wrist stays where it rests"]

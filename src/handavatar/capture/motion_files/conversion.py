@@ -1,7 +1,7 @@
 """From a track to a motion of a rig: placed, checked, carried over, at equal steps of time."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -113,9 +113,8 @@ def motion_of_file(
         tell(note)
     if track.side == "left":
         tell("a left hand, stored as the right hand that it mirrors, as left avatars are")
-    placed = _placed(track, conventions)
-    rates = (track.fps, fps)
-    rate = rates[0] or rates[1]
+    placed = replace(track, translations=track.translations * UNITS[conventions.unit])
+    rate = track.fps or fps
     if rate is None:
         raise CaptureError(
             f"{source}: it does not say how many frames a second it has", "say it with --fps"
@@ -127,16 +126,6 @@ def motion_of_file(
         return evenly_spaced(times, rotations, places, fps or rate, tell)
     except CaptureError as error:
         raise CaptureError(f"{source}: {error.what}", error.remedy) from error
-
-
-def _placed(track: HandTrack, conventions: Conventions) -> HandTrack:
-    """Translations in metres."""
-    return HandTrack(
-        **{
-            **vars(track),
-            "translations": track.translations * UNITS[conventions.unit],
-        }
-    )
 
 
 def _for_rig(

@@ -17,14 +17,15 @@ from torch import Tensor
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.motion_files.parameters import (
+    checked_vectors,
     choose_side,
     frame_numbers,
-    matrices_from_vectors,
     per_row,
     rate_of,
     refuse_mixed_rows,
     shape_rows,
     side_rows,
+    told_sides,
     track_of_rows,
 )
 from handavatar.capture.motion_files.stored import Fields, Part, array_field, first_of, rows_of
@@ -204,11 +205,7 @@ def _stored_hand(part: Part, side: Side | None, conventions: Conventions) -> _St
     sides = torch.full((count,), int(side == "right")) if side else None
     sides = side_rows(fields, count, path) if sides is None else sides
     if sides is None:
-        if conventions.side == "auto":
-            raise CaptureError(
-                f"{path}: it does not say which hand it is", "say --side left or --side right"
-            )
-        sides = torch.full((count,), int(conventions.side == "right"))
+        sides = told_sides(conventions, count, path)
     return _Stored(
         root=torch.from_numpy(root),
         fingers=torch.from_numpy(fingers),
@@ -266,8 +263,7 @@ def _track(
     vectors, notes = _absolute_vectors(
         stored.root[is_own], stored.fingers[is_own], side, conventions, find_model, source
     )
-    matrices_from_vectors(vectors, source)  # Refuses degrees.
-    rotations = matrix_from_axis_angle(vectors.unflatten(-1, (-1, 3)))
+    rotations = matrix_from_axis_angle(checked_vectors(vectors, source))
     rows = Rows(
         frames=stored.frames[is_own],
         is_right=stored.is_right[is_own],
@@ -321,18 +317,22 @@ def _absolute_vectors(
     vectors = torch.cat([root * sign, fingers], dim=1)
     if conventions.flat_hand_mean == "false":
         model = find_model(side, "the finger poses count from MANO's mean pose, which it holds")
-        vectors = add_mean(vectors, model)
+        mean = model.hands_mean.to(vectors)
+        vectors = absolute_rotations(vectors.unflatten(-1, (-1, 3)), mean).flatten(-2)
     return vectors, tuple(notes)
 
 
-def add_mean(vectors: Tensor, model: ManoModel) -> Tensor:
-    """Axis-angle of sixteen bones counted from flat, of vectors that count from the mean pose."""
-    mean = model.hands_mean.to(vectors)
-    return absolute_rotations(vectors.unflatten(-1, (-1, 3)), mean).flatten(-2)
+def with_mean(rotations: Tensor, model: ManoModel) -> Tensor:
+    """Rotations counted from flat, of those that count from the mean pose."""
+    return _beside_mean(rotations, model, 1.0)
 
 
 def without_mean(rotations: Tensor, model: ManoModel) -> Tensor:
     """The rotations that a pose would have had if a mean pose was added to it by mistake."""
+    return _beside_mean(rotations, model, -1.0)
+
+
+def _beside_mean(rotations: Tensor, model: ManoModel, share: float) -> Tensor:
+    """MANO adds its mean pose to axis-angle vectors, component by component."""
     vectors = axis_angle_from_matrix(rotations)
-    mean = model.hands_mean.to(vectors)
-    return matrix_from_axis_angle(absolute_rotations(vectors, -mean))
+    return matrix_from_axis_angle(absolute_rotations(vectors, share * model.hands_mean.to(vectors)))

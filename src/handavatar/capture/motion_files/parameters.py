@@ -75,26 +75,27 @@ def bone_matrices(
     pieces = _of_one_length(
         [rows_of(root, (3,), names[0], path), rows_of(fingers, (45,), names[1], path)], names, path
     )
-    return matrices_from_vectors(torch.from_numpy(np.concatenate(pieces, axis=1)), path)
+    vectors = checked_vectors(torch.from_numpy(np.concatenate(pieces, axis=1)), path)
+    is_empty = (vectors == 0).all(-1).all(-1)
+    return matrix_from_axis_angle(vectors) * (~is_empty[:, None, None, None])
 
 
-def matrices_from_vectors(
-    vectors: Float[Tensor, "rows values"], path: Path
-) -> Float[Tensor, "rows bones 3 3"]:
-    """Rotations of sixteen axis-angle vectors a row; rows of zeros become matrices of zeros.
+def checked_vectors(
+    values: Float[Tensor, "rows values"], path: Path
+) -> Float[Tensor, "rows bones 3"]:
+    """Numbers as axis-angle vectors of radians.
 
     Raises:
         CaptureError: a vector is longer than a full turn.
     """
-    vectors = vectors.unflatten(-1, (-1, 3))
+    vectors = values.unflatten(-1, (-1, 3))
     longest = float(vectors.norm(dim=-1).max())
     if longest > 2 * math.pi + 1e-3:
         raise CaptureError(
             f"{path}: a joint turns by {longest:.3g}, more than a full circle in radians",
             "these are degrees, or no axis-angle vectors: write radians",
         )
-    is_empty = (vectors == 0).all(-1).all(-1)
-    return matrix_from_axis_angle(vectors) * (~is_empty[:, None, None, None])
+    return vectors
 
 
 def checked_matrices(
@@ -194,6 +195,19 @@ def side_rows(fields: Fields, count: int, path: Path) -> Tensor | None:
             f"{path}: {name} is neither 0 (left) nor 1 (right) somewhere", "correct it"
         )
     return values.long()
+
+
+def told_sides(conventions: Conventions, count: int, path: Path) -> Tensor:
+    """As :func:`side_rows`, by what the user says of a file that does not say it.
+
+    Raises:
+        CaptureError: the user does not say it either.
+    """
+    if conventions.side == "auto":
+        raise CaptureError(
+            f"{path}: it does not say which hand it is", "say --side left or --side right"
+        )
+    return torch.full((count,), int(conventions.side == "right"))
 
 
 def rate_of(fields: Fields, path: Path) -> float | None:

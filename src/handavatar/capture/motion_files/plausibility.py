@@ -11,15 +11,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from handavatar.capture.checks import CaptureError
-from handavatar.capture.motion_files.mano_parameters import without_mean
+from handavatar.capture.motion_files.mano_parameters import with_mean, without_mean
 from handavatar.capture.motion_files.track import (
     UNITS,
     Conventions,
     HandTrack,
     mirrored_rotations,
 )
-from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
-from handavatar.hand.mano import ManoModel, absolute_rotations
+from handavatar.geometry.rotations import axis_angle_from_matrix
+from handavatar.hand.mano import ManoModel
 from handavatar.hand.pose import BONE_NAMES, FINGER_BONES
 from handavatar.hand.pose_sampling import angles_from_rotations, limit_bounds
 from handavatar.hand.rig import Rig
@@ -182,12 +182,10 @@ def _other_conventions(
     if layout in _OF_MATRICES:
         tries.append(("its matrices are for row vectors: transpose them", rotations.mT))
     elif model is not None:
-        vectors = axis_angle_from_matrix(rotations)
-        added = absolute_rotations(vectors, model.hands_mean.to(vectors))
         tries += [
             (
                 "its poses count from MANO's mean pose: --layout mano --flat-hand-mean false",
-                matrix_from_axis_angle(added),
+                with_mean(rotations, model),
             ),
             (
                 "its poses hold MANO's mean pose already: --layout mano --flat-hand-mean true",

@@ -28,9 +28,9 @@ from handavatar.capture.checks import CaptureError
 from handavatar.capture.motion import Motion
 from handavatar.capture.motion_files.parameters import (
     checked_matrices,
+    checked_vectors,
     choose_side,
     frame_numbers,
-    matrices_from_vectors,
     rate_of,
     track_of_rows,
 )
@@ -276,8 +276,7 @@ def _stored_rotations(part: Part, count: int) -> Float[Tensor, "steps joints 3 3
         )
     if kind == "matrix":
         return checked_matrices(poses, part.path)
-    matrices_from_vectors(poses.flatten(1), part.path)  # Refuses degrees.
-    return matrix_from_axis_angle(poses)
+    return matrix_from_axis_angle(checked_vectors(poses.flatten(1), part.path))
 
 
 def _rest_orientations(part: Part, names: list[str], prefix: str) -> dict[str, Tensor]:

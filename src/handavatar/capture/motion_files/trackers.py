@@ -23,6 +23,7 @@ from handavatar.capture.motion_files.parameters import (
     refuse_mixed_rows,
     shape_rows,
     side_rows,
+    told_sides,
     track_of_rows,
 )
 from handavatar.capture.motion_files.stored import (
@@ -66,7 +67,7 @@ def read_hamer(
         count = len(rotations)
         sides = side_rows(part.fields, count, part.path)
         if sides is None:
-            sides = _told_side(conventions, count, part.path)
+            sides = told_sides(conventions, count, part.path)
         refuse_mixed_rows(part, sides, is_alone=len(parts) == 1)
         pieces.append(
             Rows(
@@ -88,14 +89,6 @@ def read_hamer(
         fps=rate_of(parts[0].fields, parts[0].path),
         describes_right=describes_right,
     )
-
-
-def _told_side(conventions: Conventions, count: int, path: Path) -> Tensor:
-    if conventions.side == "auto":
-        raise CaptureError(
-            f"{path}: it does not say which hand it is", "say --side left or --side right"
-        )
-    return torch.full((count,), int(conventions.side == "right"))
 
 
 def _places(part: Part, sides: Tensor, conventions: Conventions) -> Float[Tensor, "placed 3"]:
@@ -218,7 +211,7 @@ def _hawor_side(path: Path, conventions: Conventions, count: int) -> Tensor:
     folder = path.absolute().parent
     if folder.name in ("0", "1") and folder.parent.name == "cam_space":
         return torch.full((count,), int(folder.name))
-    return _told_side(conventions, count, path)
+    return told_sides(conventions, count, path)
 
 
 def is_hawor(source: Path, fields: dict[str, object]) -> bool:
