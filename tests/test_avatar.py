@@ -3,6 +3,7 @@
 import copy
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,7 @@ from handavatar.hand.parts import POINT_ROUNDS, divide_into_parts
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import Rig
+from handavatar.jobs.finite import NotFinite
 from handavatar.plain import plain_rays
 from handavatar.train.prior import load_prior
 
@@ -419,6 +421,13 @@ def test_garbage_and_missing_files_are_refused(tmp_path: Path) -> None:
         HandAvatar.load(tmp_path / "nothing")
 
 
+def _about(file: Path) -> dict[str, Any]:
+    """What an avatar file says of itself beside its tensors."""
+    with safe_open(file, framework="pt") as opened:
+        about: dict[str, Any] = json.loads(opened.metadata()["handavatar"])
+    return about
+
+
 def _rewritten(file: Path, tmp_path: Path, about: object, drop: str = "-") -> Path:
     tensors = {name: value for name, value in load_file(file).items() if not name.startswith(drop)}
     path = tmp_path / "other.safetensors"
@@ -449,11 +458,54 @@ def test_a_file_that_says_too_little_is_refused(file: Path, tmp_path: Path, abou
 
 @pytest.mark.parametrize("drop", ["rig.faces", "avatar.albedo", "avatar.occupancy.encoder"])
 def test_a_file_that_lacks_tensors_is_refused(file: Path, tmp_path: Path, drop: str) -> None:
-    with safe_open(file, framework="pt") as opened:
-        about = json.loads(opened.metadata()["handavatar"])
+    about = _about(file)
     assert HandAvatar.load(_rewritten(file, tmp_path, about)).rounds == 0
     with pytest.raises(CheckpointError, match="not a complete avatar"):
         HandAvatar.load(_rewritten(file, tmp_path, about, drop))
+
+
+def test_an_avatar_with_nan_is_not_saved_and_the_old_file_stays(
+    small_avatar: HandAvatar, file: Path
+) -> None:
+    before = file.read_bytes()
+    spoilt = copy.deepcopy(small_avatar)
+    with torch.no_grad():
+        spoilt.albedo.codes[7, 3] = math.nan
+    with pytest.raises(NotFinite, match=r"not saved: avatar\.albedo\.codes holds nan at \[7, 3\]"):
+        spoilt.save(file)
+    dimmed = copy.copy(small_avatar)
+    dimmed.edit = Edit(light_gain=math.inf)
+    with pytest.raises(NotFinite, match=r"edit\.light_gain is inf"):
+        dimmed.save(file)
+    assert file.read_bytes() == before
+    assert [path.name for path in file.parent.iterdir()] == [file.name]
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize(
+    "name", ["avatar.albedo.codes", "avatar.occupancy.decoder.mlp.output.bias", "rig.skin_weights"]
+)
+def test_an_avatar_file_with_nan_is_refused_and_the_tensor_named(
+    small_avatar: HandAvatar, file: Path, tmp_path: Path, name: str, bad: float
+) -> None:
+    tensors = load_file(file)
+    tensors[name].view(-1)[0] = bad
+    spoilt = tmp_path / "spoilt.safetensors"
+    save_file(tensors, spoilt, {"handavatar": json.dumps(_about(file))})
+    for load in (HandAvatar.load, small_avatar.reloaded):
+        with pytest.raises(CheckpointError, match=rf"spoilt\.safetensors: {re.escape(name)} holds"):
+            load(spoilt)
+
+
+@pytest.mark.parametrize("key", ["light_gain", "margin", "sharpness"])
+def test_an_avatar_file_whose_numbers_are_nan_is_refused(
+    file: Path, tmp_path: Path, key: str
+) -> None:
+    about = _about(file)
+    holder = about["edit"] if key in about["edit"] else about
+    holder[key] = math.nan
+    with pytest.raises(CheckpointError, match=rf"{key} is nan, expected finite numbers"):
+        HandAvatar.load(_rewritten(file, tmp_path, about))
 
 
 def test_a_failed_save_leaves_the_old_file(
@@ -596,8 +648,7 @@ def test_a_light_that_there_is_not_is_refused_by_its_number(
 
 
 def test_the_file_of_one_light_says_nothing_of_lights(file: Path) -> None:
-    with safe_open(file, "pt") as opened:
-        about = json.loads(opened.metadata()["handavatar"])
+    about = _about(file)
     assert about["edit"].keys() == {"light_gain", "albedo_shift", "lifted_bones"}
     assert not [name for name in about if "light" in name]
     assert HandAvatar.load(file).num_lights == 1

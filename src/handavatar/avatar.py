@@ -40,6 +40,7 @@ from handavatar.hand.parts import finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import RIG_ARRAYS, PosedHand, Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
+from handavatar.jobs.finite import find_not_finite, require_finite
 from handavatar.jobs.threads import mapped
 from handavatar.render.chart import charted
 from handavatar.render.rasterize import covered_pixels
@@ -864,6 +865,9 @@ class HandAvatar(nn.Module):
         """Writes one safetensors file, aside first, then renamed into place.
 
         Of a licensed rig it holds only name and fingerprint.
+
+        Raises:
+            NotFinite: if a tensor or a number is NaN or infinite; nothing is written then.
         """
         tensors = {f"avatar.{name}": value for name, value in self.state_dict().items()}
         if self.base_rig.is_licensed:
@@ -895,6 +899,7 @@ class HandAvatar(nn.Module):
         }
         if self.edit.light is not None:
             about["edit"]["light"] = self.edit.light
+        require_finite({**tensors, **about}, f"{path}: not saved")
         path.parent.mkdir(parents=True, exist_ok=True)
         aside = path.with_name(path.name + ".tmp")
         stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
@@ -909,7 +914,8 @@ class HandAvatar(nn.Module):
             path: an avatar file, or the folder of a finished run.
 
         Raises:
-            CheckpointError: if the file is missing, damaged, or not an avatar of this schema.
+            CheckpointError: if the file is missing, damaged, not an avatar of this schema, or holds
+                NaN or infinity; it names the tensor.
             RigError: if it was made with a licensed rig that is not imported here.
         """
         about, tensors = _stored(Path(path))
@@ -999,6 +1005,12 @@ def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if not isinstance(about, dict) or about.get("schema") != SCHEMA:
         raise CheckpointError(
             f"{path}: not an avatar of schema {SCHEMA}; train it again with this version"
+        )
+    if found := find_not_finite({**tensors, **about}):
+        raise CheckpointError(
+            f"{path}: {found}, expected finite numbers\n"
+            "copy the file again, or train again into its run, from the last checkpoint: "
+            f"handavatar train CAPTURE --out {path.parent} --resume auto"
         )
     return about, tensors
 

@@ -15,6 +15,7 @@ import torch
 
 from handavatar.avatar import CheckpointError
 from handavatar.jobs.files import MARKER
+from handavatar.jobs.finite import NotFinite
 from handavatar.train import runs
 from handavatar.train.optimizer_state import (
     optimizer_options,
@@ -374,9 +375,48 @@ def test_nan_never_reaches_a_file(tmp_path: Path) -> None:
     run = _new_run(tmp_path / "run")
     with pytest.raises(ValueError):
         append_log(run, 1, {"loss": float("nan")})
-    with pytest.raises(ValueError):
+    with pytest.raises(NotFinite, match=r"checkpoint of step 1: state\.loss is inf"):
         save_checkpoint(run, 1, {}, {"loss": float("inf")})
     assert not run.log.exists() and latest_checkpoint(run) is None
+
+
+@pytest.mark.parametrize("stem", ["model", "optimizer"])
+def test_a_checkpoint_with_nan_is_not_written_and_the_one_before_stays(
+    tmp_path: Path, stem: str
+) -> None:
+    run = _new_run(tmp_path / "run")
+    _save(run, 3)
+    tensors = _tensors(4)
+    name = {"model": "layer.weight", "optimizer": "0.exp_avg"}[stem]
+    tensors[stem][name][2, 1] = float("nan")
+    with pytest.raises(NotFinite, match=rf"of step 4: {stem}\.{name} holds nan at \[2, 1\]"):
+        save_checkpoint(run, 4, tensors, {"step": 4, "rate": 0.1})
+    _assert_holds(run, 3)
+    assert [path.name for path in run.checkpoints.iterdir()] == ["step-000000003"]
+
+
+@pytest.mark.parametrize("file", ["model", "state"])
+def test_a_checkpoint_that_an_older_version_wrote_with_nan_is_put_aside(
+    tmp_path: Path, file: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = _new_run(tmp_path / "run")
+    _save(run, 3)
+    tensors, state = _tensors(4), {"step": 4, "rate": 0.1}
+    with monkeypatch.context() as older:
+        older.setattr(runs, "require_finite", lambda *_: None)
+        dumps = json.dumps
+        older.setattr(runs.json, "dumps", lambda value, **_: dumps(value))
+        if file == "model":
+            tensors["model"]["layer.weight"][0, 0] = float("inf")
+        else:
+            state["rate"] = float("nan")
+        checkpoint = save_checkpoint(run, 4, tensors, state)
+    what = {"model": r"model\.layer\.weight holds inf at \[0, 0\]", "state": r"state\.rate is nan"}
+    with pytest.raises(CheckpointError, match=f"cannot be gone on from: {what[file]}"):
+        load_checkpoint(checkpoint)
+    _assert_holds(run, 3)
+    assert (run.folder / "corrupt" / "step-000000004").is_dir()
+    assert "step-000000004" in caplog.text and "moved to corrupt/" in caplog.text
 
 
 def _trained(num_steps: int, model: torch.nn.Linear, optimizer: torch.optim.Optimizer) -> None:
