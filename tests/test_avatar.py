@@ -4,7 +4,9 @@ import copy
 import json
 import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from handavatar.field.anchors import Neighbours
 from handavatar.field.shading import CueSet, OrientedCues, TracedCues
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.hand import parts
 from handavatar.hand.detail import subdivided
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import POINT_ROUNDS, divide_into_parts
@@ -442,6 +445,54 @@ def test_the_field_is_given_the_points_that_its_prior_knows(rig: Rig, rounds: in
     assert torch.equal(avatar.parts.corner_indices, known.corner_indices)
     assert torch.equal(avatar.parts.barycentric, known.barycentric)
     assert len(avatar.parts.vertex_labels) == avatar.rig.num_vertices
+
+
+def test_an_avatar_keeps_its_part_points_however_others_are_drawn(
+    small_avatar: HandAvatar,
+    rendering: Rendering,
+    file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Another torch may draw others; and a version that stored none drew them at every load."""
+    older = _rewritten(file, tmp_path, _about(file), "parts.")
+
+    def shown(avatar: HandAvatar) -> Rendering:
+        return avatar.render(bent_pose(2), camera_above(24), settings=FEW)
+
+    for avatar in (HandAvatar.load(older), small_avatar.reloaded(older)):
+        _assert_equal(shown(avatar), rendering)
+    monkeypatch.setattr(parts, "divide_into_parts", partial(divide_into_parts, seed=1))
+    redrawn = HandAvatar.load(older)
+    assert not torch.equal(shown(redrawn).alpha, rendering.alpha)
+    for avatar in (HandAvatar.load(file), redrawn.reloaded(file)):
+        assert torch.equal(avatar.parts.corner_indices, small_avatar.parts.corner_indices)
+        assert torch.equal(avatar.parts.vertex_labels, small_avatar.parts.vertex_labels)
+        _assert_equal(shown(avatar), rendering)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda stored: {"corners": stored["corners"] + 5000}, "expected vertices of a rig of 778"),
+        (lambda stored: {"corners": -stored["corners"]}, "expected vertices of a rig of 778"),
+        (lambda stored: {n: values[:-1] for n, values in stored.items()}, "for each of 16 parts"),
+        (lambda stored: {n: values[:0] for n, values in stored.items()}, "for each of 16 parts"),
+        (lambda stored: {"corners": stored["corners"][:-16]}, "not a complete avatar"),
+    ],
+)
+def test_part_points_that_are_not_on_the_rig_are_refused(
+    file: Path,
+    tmp_path: Path,
+    change: Callable[[dict[str, torch.Tensor]], dict[str, torch.Tensor]],
+    message: str,
+) -> None:
+    tensors = load_file(file)
+    stored = {name: tensors[f"parts.{name}"] for name in ("corners", "barycentric")}
+    tensors |= {f"parts.{name}": values.contiguous() for name, values in change(stored).items()}
+    save_file(tensors, tmp_path / "spoilt", {"handavatar": json.dumps(_about(file))})
+    with pytest.raises(CheckpointError, match=message):
+        HandAvatar.load(tmp_path / "spoilt")
 
 
 @pytest.mark.parametrize("about", [None, [], {"schema": SCHEMA - 1}, {"schema": SCHEMA + 1}])

@@ -69,6 +69,13 @@ def _stored_rig(name: str, tensors: dict[str, Tensor]) -> Rig:
     return Rig(name=name, vertex_sets=sets, **arrays)
 
 
+def _stored_part_points(tensors: dict[str, Tensor]) -> SurfacePoints | None:
+    """None in files of versions that drew them anew at every load."""
+    if "parts.corners" not in tensors:
+        return None
+    return SurfacePoints(tensors["parts.corners"].long(), tensors["parts.barycentric"])
+
+
 def _stored_edit(about: dict[str, Any], tensors: dict[str, Tensor]) -> Edit:
     red, green, blue = (float(value) for value in about["albedo_shift"])
     bones = tuple(int(bone) for bone in about["lifted_bones"])
@@ -266,6 +273,7 @@ class HandAvatar(nn.Module):
         cues: CueSet | None = None,
         info: dict[str, Any] | None = None,
         num_lights: int = 1,
+        part_points: SurfacePoints | None = None,
     ) -> None:
         """An untrained avatar.
 
@@ -278,13 +286,15 @@ class HandAvatar(nn.Module):
             cues: what the illumination depends on; by default the paper's.
             info: facts that travel with the avatar (side, subject, method, ...).
             num_lights: one for each clip of the capture; shape and albedo are the same in all.
+            part_points: that the occupancy's encoder sees of each part, instead of drawing new ones
+                (when loading).
         """
         super().__init__()
         self.base_rig = rig
         self.rounds = rounds
         self.info: dict[str, Any] = dict(info or {})
         self.edit = Edit()
-        self.rig, self.parts = finer_rig(rig, rounds)
+        self.rig, self.parts = finer_rig(rig, rounds, part_points)
         # Subdivision keeps the vertices it finds, and refinement gives them weights too.
         skin_weights = self.rig.skin_weights[: rig.num_vertices]
         self.coarse_rig = replace(rig, skin_weights=skin_weights)
@@ -878,6 +888,8 @@ class HandAvatar(nn.Module):
             tensors |= {f"set.{name}": value for name, value in self.base_rig.vertex_sets.items()}
             if self.base_rig.pose_directions.numel():
                 tensors["rig.pose_directions"] = self.base_rig.pose_directions
+        points = self.parts.points
+        tensors |= {"parts.corners": points.faces.int(), "parts.barycentric": points.barycentric}
         if self.edit.paint is not None:
             tensors |= {f"paint.{name}": value for name, value in vars(self.edit.paint).items()}
         about: dict[str, Any] = {
@@ -935,6 +947,7 @@ class HandAvatar(nn.Module):
                 anchors=anchors,
                 cues=cues,
                 num_lights=max(columns, 1),
+                part_points=_stored_part_points(tensors),
             )
             avatar._restore(about, tensors)
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -955,6 +968,12 @@ class HandAvatar(nn.Module):
         try:
             if (about["rig_sha256"], about["rounds"]) != (self.base_rig.sha256, self.rounds):
                 raise ValueError("it is of another rig")
+            points = _stored_part_points(tensors)
+            if points is None:
+                parts = finer_rig(self.base_rig, self.rounds)[1]
+            else:
+                parts = self.parts.with_points(points)
+            avatar.parts = parts.to(self.device)
             avatar._restore(about, tensors)
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
             raise CheckpointError(f"{path}: not a state of this avatar ({error})") from error

@@ -28,8 +28,8 @@ from handavatar.train.runs import (
     append_log,
     create_run,
     default_run_folder,
+    interrupted_run_folder,
     latest_checkpoint,
-    latest_run_folder,
     load_checkpoint,
     locked,
     open_run,
@@ -169,15 +169,51 @@ def test_no_run_folder_is_a_clear_error(tmp_path: Path) -> None:
         _ = open_run(run.folder).facts
 
 
-def test_resume_auto_finds_the_newest_run(tmp_path: Path) -> None:
-    capture = tmp_path / "hand"
-    assert latest_run_folder(capture, "quick", tmp_path) is None
-    for name in ("2030-01-01_000000", "2030-01-02_000000"):
-        _new_run(tmp_path / "hand" / "quick" / name)
-    (tmp_path / "hand" / "quick" / "2031-01-01_000000").mkdir()  # never begun
-    found = latest_run_folder(capture, "quick", tmp_path)
-    assert found is not None and found.name == "2030-01-02_000000"
-    assert default_run_folder(capture, "quick", tmp_path).parent == found.parent
+def _begun(folder: Path, started: str, sha256: str = "a", method: str = "quick") -> Path:
+    """A run that says that it was begun then."""
+    create_run(
+        folder,
+        {"method": method},
+        seed=1,
+        capture=folder,
+        capture_sha256=sha256,
+        perceptual="gradient-pyramid",
+    )
+    facts = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(facts | {"started": started}))
+    return folder
+
+
+def test_resume_auto_goes_by_what_runs_say_of_themselves(tmp_path: Path) -> None:
+    assert interrupted_run_folder("a", "quick", tmp_path) is None
+    runs_of = tmp_path / "hand" / "quick"
+    finished = _begun(runs_of / "2099-01-01_000000", "2026-11-30T12:00:00+00:00")
+    (finished / "avatar.safetensors").write_bytes(b"whole")
+    assert interrupted_run_folder("a", "quick", tmp_path) is None
+    # Named, and written, in another order than they were begun in; one in another zone.
+    earlier = _begun(runs_of / "zzz", "2026-11-30T10:30:00+01:00")
+    last = _begun(runs_of / "aaa", "2026-11-30T10:00:00+00:00")
+    os.utime(last / "run.json", (0, 0))
+    os.utime(earlier / "run.json")
+    _begun(runs_of / "other-capture", "2026-11-30T11:00:00+00:00", sha256="b")
+    _begun(runs_of / "other-method", "2026-11-30T11:00:00+00:00", method="best")
+    (runs_of / "never-begun").mkdir()
+    assert interrupted_run_folder("a", "quick", tmp_path) == last
+    (last / "avatar.safetensors").write_bytes(b"whole")
+    assert interrupted_run_folder("a", "quick", tmp_path) == earlier
+    default = default_run_folder(tmp_path / "hand", "quick", tmp_path)
+    assert default.parent == runs_of
+
+
+@pytest.mark.parametrize("text", ['{"capture": ', "[]", "{}", '{"capture": 3, "started": "now"}'])
+def test_resume_auto_passes_over_what_cannot_be_read_and_says_so(
+    tmp_path: Path, text: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    broken = _begun(tmp_path / "hand" / "quick" / "2099", "2026-11-30T12:00:00+00:00")
+    (broken / "run.json").write_text(text)
+    whole = _begun(tmp_path / "hand" / "quick" / "2000", "2026-11-30T10:00:00+00:00")
+    assert interrupted_run_folder("a", "quick", tmp_path) == whole
+    assert "2099: is passed over" in caplog.text
 
 
 def test_checkpoints_return_bit_for_bit_and_old_ones_are_pruned(tmp_path: Path) -> None:

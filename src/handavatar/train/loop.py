@@ -20,7 +20,7 @@ from handavatar.evaluate.perceptual import PerceptualChoice, PerceptualLoss, per
 from handavatar.field.shading import CueSet, OrientedCues, PaperCues, TracedCues
 from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
-from handavatar.geometry.meshes import is_inside
+from handavatar.geometry.meshes import SurfacePoints, is_inside
 from handavatar.geometry.rotations import mean_rotation
 from handavatar.hand.rigs import find_rig
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
@@ -67,8 +67,8 @@ from handavatar.train.runs import (
     append_log,
     create_run,
     default_run_folder,
+    interrupted_run_folder,
     latest_checkpoint,
-    latest_run_folder,
     load_checkpoint,
     locked,
     open_run,
@@ -232,8 +232,8 @@ class TrainOptions:
             that is traced instead of guessed, ``paper`` for the paper's; ``joint`` is ``quick``
             with geometry and appearance learned together from the first step on, for comparison.
         steps: overrides the method's number of steps.
-        resume: ``auto`` continues the newest run of this capture and method (or the one at
-            ``out``) if there is one; ``never`` starts anew.
+        resume: ``auto`` continues the run at ``out``, or by default the last one of this capture
+            and method that was begun and is not finished, if there is one; ``never`` starts anew.
         prior: occupancy prior to start from.
         perceptual: ``auto`` takes LPIPS where its weights are present, else the features of a
             network that the extra ``perceptual`` installs, else the substitute; the run records
@@ -549,7 +549,12 @@ def _fit_or_restore_outlines(
         _save(run, training, tensors, 0)
         return tensors
     training.avatar.occupancy.sharpness = method.sharpness
-    tensors = load_checkpoint(checkpoint).tensors["outlines"]
+    stored = load_checkpoint(checkpoint).tensors
+    tensors = stored["outlines"]
+    if "parts" in stored:  # Older checkpoints have none; they are drawn alike.
+        points = SurfacePoints(stored["parts"]["corners"], stored["parts"]["barycentric"])
+        parts = training.avatar.parts.with_points(points)
+        training.avatar.parts = parts.to(training.avatar.device)
     training.avatar.coefficients.copy_(tensors["coefficients"])
     for prefix, module in modules.items():
         module.load_state_dict(_named(tensors, prefix))
@@ -845,18 +850,26 @@ def _clear_gradients(training: Training) -> None:
 
 
 def run_folder(options: TrainOptions) -> Path:
-    """Where a training with these options goes on, or begins: ``out``, if that is given."""
+    """Where a training with these options goes on, or begins: ``out``, if that is given.
+
+    Raises:
+        CaptureError: if the capture cannot be read.
+    """
     if options.out is not None:
         return options.out
+    return _default_folder(options, read_capture(options.capture))
+
+
+def _default_folder(options: TrainOptions, capture: Capture) -> Path:
     if options.resume == "auto":
-        begun = latest_run_folder(options.capture, options.method)
-        if begun is not None and not (begun / "avatar.safetensors").exists():
+        begun = interrupted_run_folder(capture.sha256, options.method)
+        if begun is not None:
             return begun
     return default_run_folder(options.capture, options.method)
 
 
 def _open_or_create(options: TrainOptions, capture: Capture, perceptual: str, steps: int) -> Run:
-    folder = run_folder(options)
+    folder = options.out or _default_folder(options, capture)
     if options.resume == "auto" and (folder / "run.json").exists():
         run = open_run(folder)
         _require_same_training(run, options, capture)
@@ -909,7 +922,9 @@ def model_tensors(training: Training) -> dict[str, Tensor]:
 
 
 def _save(run: Run, training: Training, outlines: dict[str, Tensor], step: int) -> None:
-    tensors = {"model": model_tensors(training), "outlines": outlines}
+    points = training.avatar.parts.points
+    parts = {"corners": points.faces, "barycentric": points.barycentric}
+    tensors = {"model": model_tensors(training), "outlines": outlines, "parts": parts}
     tensors |= {name: optimizer_tensors(part) for name, part in training.optimizers.items()}
     state = {name: optimizer_options(part) for name, part in training.optimizers.items()}
     save_checkpoint(run, step, tensors, state)

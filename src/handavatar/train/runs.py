@@ -155,10 +155,36 @@ def default_run_folder(capture: Path, method: str, outputs: Path = Path("outputs
     return outputs / capture.resolve().name / method / datetime.now().strftime("%Y-%m-%d_%H%M%S")
 
 
-def latest_run_folder(capture: Path, method: str, outputs: Path = Path("outputs")) -> Path | None:
-    """The newest run of a capture and method that has begun, for ``--resume auto``."""
-    runs = (outputs / capture.resolve().name / method).glob("*/run.json")
-    return max((path.parent for path in runs), default=None, key=lambda folder: folder.name)
+def interrupted_run_folder(
+    capture_sha256: str, method: str, outputs: Path = Path("outputs")
+) -> Path | None:
+    """The run to go on with: of those that are not finished, the one that was begun last.
+
+    What a run is of, when it was begun and whether it is finished it says itself; names and dates
+    of folders say nothing. Of what cannot be read, a warning tells.
+
+    Args:
+        capture_sha256: fingerprint of the capture.
+        method: of the training.
+        outputs: whose runs, three folders deep, are asked.
+    """
+    found: list[tuple[datetime, Path]] = []
+    for path in sorted(outputs.glob("*/*/*/run.json")):
+        run = Run(path.parent)
+        if run.avatar.exists():
+            continue
+        try:
+            facts, options = run.facts, run.options
+            is_of = facts["capture"]["sha256"], options["method"]
+            begun = datetime.fromisoformat(facts["started"])
+        except (CheckpointError, OSError, KeyError, TypeError, ValueError) as error:
+            what = str(error).splitlines()[0] if isinstance(error, CheckpointError) else repr(error)
+            _log.warning("%s: is passed over (%s)", run.folder, what)
+            continue
+        if is_of == (capture_sha256, method):
+            # Without a zone it is local time.
+            found.append((begun.astimezone(), run.folder))
+    return max(found)[1] if found else None
 
 
 def create_run(
