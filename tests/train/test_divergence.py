@@ -130,7 +130,10 @@ def _result(
         def spoilt(*arguments: Any, **named: Any) -> Any:
             result = work(*arguments, **named)
             left[0] -= 1
-            return result * bad if left[0] == 0 else result
+            if left[0] != 0:
+                return result
+            # The first of several results is the loss.
+            return (result[0] * bad, *result[1:]) if isinstance(result, tuple) else result * bad
 
         patch.setattr(module, name, spoilt)
 
@@ -347,9 +350,6 @@ INJECTIONS: dict[str, Injection] = {
         _in_frames(lambda f: _camera(f, camera_from_world=torch.full((4, 4), NAN))),
         "frame 000001 .*camera_from_world",
     ),
-    "frame: confidence": Injection(
-        _in_frames(lambda f: replace(f, confidence=NAN)), "frame 000001 .*confidence is nan"
-    ),
     "capture: shape coefficients": Injection(_spoilt_coefficients, "first step: avatar.coefficie"),
     "file: prior": Injection(lambda _: None, "encoder.input.weight holds nan", prior=True),
     # Before the first step.
@@ -441,7 +441,9 @@ INJECTIONS: dict[str, Injection] = {
     "warm step: wrist": Injection(
         _after_step(2, _weight("avatar.illumination.wrist_reference")), "step 2: .*wrist_reference"
     ),
-    "warm step: loss": Injection(_result(loop, "appearance_loss", NAN), "step 1: "),
+    "warm step: loss": Injection(
+        _result(loop, "appearance_loss", NAN), "step 1: loss.color is nan"
+    ),
     "warm step: gradient": Injection(_gradient_in_step(2, "adam"), "step 2: avatar.* holds nan"),
     "warm step: muon's gradient": Injection(
         _gradient_in_step(3, "muon"), "step 3: avatar.* holds nan"
