@@ -6,6 +6,7 @@ do; whoever does that gets a finite avatar.
 
 import math
 import re
+import shlex
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -18,14 +19,15 @@ from conftest import TINY, bent_pose, camera_above, write_tiny_capture
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from handavatar.avatar import CheckpointError, HandAvatar, RenderSettings
-from handavatar.capture.frames import Capture, CaptureError, Frame
-from handavatar.cli.failures import BAD_DATA, NUMERICAL, explanation
+from handavatar.avatar import HandAvatar, RenderSettings
+from handavatar.capture.frames import Capture, Frame
+from handavatar.cli import main
+from handavatar.cli.failures import BAD_DATA, NUMERICAL
 from handavatar.field.shading import TracedCues
 from handavatar.hand.pose import HandPose
-from handavatar.jobs.finite import NotFinite, find_not_finite
+from handavatar.jobs.finite import find_not_finite
 from handavatar.train import border, detail, loop, outlines, pretraining, registration, sky
-from handavatar.train.loop import METHODS, Training, TrainOptions, train
+from handavatar.train.loop import METHODS, Training
 from handavatar.train.prior import SHIPPED_PRIOR
 from handavatar.train.runs import open_run, read_log
 
@@ -493,10 +495,9 @@ INJECTIONS: dict[str, Injection] = {
 # --- the trainings --------------------------------------------------------------------------------
 
 
-def _options(capture: Path, out: Path) -> TrainOptions:
-    return TrainOptions(
-        capture, out, steps=STEPS, checkpoint_every=2, device="cpu", perceptual="substitute"
-    )
+def _words(capture: Path, steps: int = STEPS) -> list[str]:
+    options = f"--steps {steps} --checkpoint-every 2 --device cpu --perceptual substitute"
+    return ["train", str(capture), *options.split()]
 
 
 @pytest.fixture(scope="module")
@@ -523,7 +524,7 @@ def begun(
             run = folder / str(len(known))
             with pytest.MonkeyPatch.context() as patch:
                 patch.setitem(METHODS, "quick", method)
-                train(replace(_options(captures[is_tracked], run), steps=1))
+                assert main([*_words(captures[is_tracked], 1), "--out", str(run)]) == 0
             shutil.rmtree(run / "checkpoints" / "step-000000001")
             (run / "avatar.safetensors").unlink()
             known[key] = run
@@ -555,43 +556,45 @@ def test_a_training_with_nan_ends_in_a_finite_avatar_or_a_clear_stop(
     begun: Callable[[bool, loop.Method], Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     injection = INJECTIONS[name]
     run = tmp_path / "run"
-    options = _options(captures[injection.is_tracked], run)
+    capture = captures[injection.is_tracked]
     if not injection.is_whole and not injection.expected.startswith("frame"):
         shutil.copytree(begun(injection.is_tracked, injection.method), run)
     monkeypatch.setitem(METHODS, "quick", injection.method)
-    given = options
+    given = []
     if injection.prior:
         tensors = load_file(SHIPPED_PRIOR)
         _put(tensors["encoder.input.weight"], NAN)
         save_file(tensors, tmp_path / "prior")
-        given = replace(options, prior=tmp_path / "prior")
+        given = ["--prior", str(tmp_path / "prior")]
     with monkeypatch.context() as patch:
         injection.inject(patch)
-        with pytest.raises((NotFinite, CheckpointError, CaptureError, Killed)) as caught:
-            train(given)
-    if isinstance(caught.value, Killed):  # Nobody knows yet that the checkpoint is bad.
-        train(options)
+        code = main([*_words(capture), *given, "--out", str(run)])
+    message = capsys.readouterr().err
+    if "Killed" in message:  # Nobody knows yet that the checkpoint is bad.
+        assert main([*_words(capture), "--out", str(run)]) == 0
         assert (run / "corrupt" / "step-000000004").is_dir()
         _assert_good_checkpoints(run)
         _assert_finite_avatar(run)
         return
-    code, message = explanation(caught.value)
-    assert code in (BAD_DATA, NUMERICAL)
-    assert re.search(injection.expected, message), message
+    said = message[message.index("handavatar: ") :]
+    assert code in (BAD_DATA, NUMERICAL) and "a mistake in handavatar" not in said
+    assert len(said.splitlines()) <= 4
+    assert re.search(injection.expected, said), said
     assert not (run / "avatar.safetensors").exists()
     _assert_good_checkpoints(run)
 
     # As it is advised: another seed in the same run, or without what was wrong.
-    words = re.search(r"again with --out (\S+) --resume auto --seed (\d+)$", message)
-    if isinstance(caught.value, NotFinite) and "first step" not in injection.expected:
-        assert words is not None, message
-        options = replace(options, out=Path(words[1]), resume="auto", seed=int(words[2]))
+    again = ["--out", str(run)]
+    if said.splitlines()[-1].startswith("give the same command again with "):
+        again = shlex.split(said.splitlines()[-1].partition(" with ")[2])
+        assert again[:-1] == ["--out", str(run), "--resume", "auto", "--seed"]
     else:
-        assert re.search("drop the frame|check the capture|leave it out", message), message
-    train(options)
+        assert re.search("drop the frame|check the capture|leave it out", said), said
+    assert main([*_words(capture), *again]) == 0
     _assert_good_checkpoints(run)
     _assert_finite_avatar(run)
 

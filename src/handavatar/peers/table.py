@@ -96,8 +96,9 @@ def peers_table(
             for _ in range((len(OURS) + len(PEERS)) * len(options.seeds)):
                 finished()
         else:
-            found = about | {"capture": folder.name, "rows": _measured(folder, options, finished)}
-            found = json.loads(json.dumps(found | origin(sha256, found["rows"])))
+            rows = _measured(folder, options, finished)
+            found = about | {"capture": folder.name, "rows": rows} | origin(sha256, rows)
+            found = json.loads(json.dumps(found))
             make_folder(options.kept, TABLES)
             write_json(path, found)
         measured.append(found)
