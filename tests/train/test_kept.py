@@ -154,9 +154,9 @@ def test_there_is_nothing_to_read_where_nothing_is_kept(tmp_path: Path) -> None:
     assert read_kept(tmp_path / "none.json", "0", False) == {}
 
 
-def _commands() -> list[str]:
+def _commands(option: str) -> list[str]:
     text = "\n".join(path.read_text() for path in sorted(DOCS.glob("*.md")))
-    return re.findall(r"^handavatar (bench .*--kept docs/ablation.*)$", text, re.MULTILINE)
+    return re.findall(rf"^handavatar (bench .*{option}.*)$", text, re.MULTILINE)
 
 
 def test_the_documents_commands_that_show_kept_figures_still_show_them(
@@ -165,8 +165,9 @@ def test_the_documents_commands_that_show_kept_figures_still_show_them(
     """With a stand-in for the made capture, of which the figures of older versions know nothing."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "docs").symlink_to(DOCS)
-    assert len(_commands()) >= 3
-    for command in _commands():
+    commands = _commands("--kept docs/ablation")
+    assert len(commands) >= 3
+    for command in commands:
         words = shlex.split(command)
         made = Path(words[words.index("--captures") + 1])
         if not made.exists():
@@ -178,3 +179,21 @@ def test_the_documents_commands_that_show_kept_figures_still_show_them(
     options = AblationTableOptions((made,), KEPT, steps=1)
     with pytest.raises(AssertionError, match="measured anew"):
         ablation_table(replace(options, kept=tmp_path / "empty"))
+
+
+def test_the_documents_command_that_shows_kept_trainings_says_which_commits_they_are_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(DOCS / "geometry", tmp_path / "docs" / "geometry")
+    (command,) = _commands("--priors docs/geometry")
+    assert main(shlex.split(command)) == 0
+    printed = capsys.readouterr().out
+    for contender in ("pair", "coap", "transformer"):
+        commit = json.loads((DOCS / "geometry" / f"{contender}-1.json").read_text())["commit"]
+        notes = [
+            line
+            for line in printed.splitlines()
+            if f"Trainings: measured by commit {commit}" in line
+        ]
+        assert len(notes) == 1 and f"{contender}-1" in notes[0] and present_commit() in notes[0]

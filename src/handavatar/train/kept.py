@@ -112,13 +112,23 @@ def origin_notes(kept: Mapping[str, Mapping[str, Any]]) -> tuple[str, ...]:
                 "compared with the capture."
             )
             continue
-        of_commits: dict[str, list[str]] = {}
-        for row, commit in figures["commits"].items():
-            of_commits.setdefault(commit, []).append(row)
-        notes += [
-            f"{name}: measured by commit {commit}, not by this one ({present_commit()}): "
-            f"{', '.join(rows)}."
-            for commit, rows in of_commits.items()
-            if commit != present_commit()
-        ]
+        notes += commit_notes(name, figures["commits"])
     return tuple(notes)
+
+
+def commit_notes(name: str, commits: Mapping[str, str]) -> list[str]:
+    """Which figures other commits have measured; nothing if none have.
+
+    Args:
+        name: of what the figures are of.
+        commits: by what each of them measured.
+    """
+    of_commits: dict[str, list[str]] = {}
+    for what, commit in commits.items():
+        of_commits.setdefault(commit, []).append(what)
+    return [
+        f"{name}: measured by commit {commit}, not by this one ({present_commit()}): "
+        f"{', '.join(measured)}."
+        for commit, measured in of_commits.items()
+        if commit != present_commit()
+    ]
