@@ -522,7 +522,7 @@ def test_an_avatar_with_nan_is_not_saved_and_the_old_file_stays(
     spoilt = copy.deepcopy(small_avatar)
     with torch.no_grad():
         spoilt.albedo.codes[7, 3] = math.nan
-    with pytest.raises(NotFinite, match=r"not saved: avatar\.albedo\.codes holds nan at \[7, 3\]"):
+    with pytest.raises(NotFinite, match=r"not saved: avatar\.albedo\.codes holds NaN at \[7, 3\]"):
         spoilt.save(file)
     dimmed = copy.copy(small_avatar)
     dimmed.edit = Edit(light_gain=math.inf)
@@ -555,7 +555,7 @@ def test_an_avatar_file_whose_numbers_are_nan_is_refused(
     about = _about(file)
     holder = about["edit"] if key in about["edit"] else about
     holder[key] = math.nan
-    with pytest.raises(CheckpointError, match=rf"{key} is nan, expected finite numbers"):
+    with pytest.raises(CheckpointError, match=rf"{key} is NaN, expected finite numbers"):
         HandAvatar.load(_rewritten(file, tmp_path, about))
 
 

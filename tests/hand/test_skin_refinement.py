@@ -245,10 +245,10 @@ def test_a_continued_refinement_is_the_same(problem: SkinRefinement, tmp_path: P
         RefinementState.load(file, other)
     spoilt = problem.begin()
     spoilt.mean_gradient[5, 2] = float("nan")
-    with pytest.raises(NotFinite, match=r"not saved: mean_gradient holds nan at \[5, 2\]"):
+    with pytest.raises(NotFinite, match=r"not saved: mean_gradient holds NaN at \[5, 2\]"):
         spoilt.save(file, problem)
     assert RefinementState.load(file, problem).step == TINY.steps + 2
-    with pytest.raises(NotFinite, match=r"step 1: weights holds nan at \[5, 2\]"):
+    with pytest.raises(NotFinite, match=r"step 1: weights holds NaN at \[5, 2\]"):
         refine_skin(problem, spoilt)
     file.write_bytes(b"short")
     with pytest.raises(RigError, match="delete it"):

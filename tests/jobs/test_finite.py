@@ -32,20 +32,21 @@ def test_one_value_of_a_tensor_is_found_and_its_place_named(bad: float, kind: to
     weights = torch.ones(4, 3, dtype=kind)
     weights[2, 1] = bad
     found = find_not_finite({"fine": torch.ones(2), "layer.weight": weights})
-    assert found == f"layer.weight holds {bad} at [2, 1] (1 of 12 values are not finite)"
+    name = "NaN" if math.isnan(bad) else str(bad)
+    assert found == f"layer.weight holds {name} at [2, 1] (1 of 12 values are not finite)"
 
 
 def test_infinities_that_cancel_are_found() -> None:
     found = find_not_finite({"x": torch.tensor([math.inf, -math.inf])})
     assert found == "x holds inf at [0] (2 of 2 values are not finite)"
     assert find_not_finite({"x": torch.tensor(math.nan)}) == (
-        "x holds nan (1 of 1 values are not finite)"
+        "x holds NaN (1 of 1 values are not finite)"
     )
 
 
 def test_numbers_deep_inside_are_found() -> None:
     state = {"adam": {"param_groups": [{"lr": 0.1}, {"betas": (0.9, math.nan)}]}}
-    assert find_not_finite(state) == "adam.param_groups.1.betas.1 is nan"
+    assert find_not_finite(state) == "adam.param_groups.1.betas.1 is NaN"
 
 
 def test_the_error_says_where_and_what_to_do() -> None:

@@ -84,7 +84,7 @@ def test_a_training_that_diverges_keeps_the_last_good_state_and_says_how_to_go_o
         monkeypatch.setattr(TrackerTraining, "teach", spoilt)
 
     spoiling(1)
-    with pytest.raises(NotFinite, match=r"step 1: network\.verdict\.bias holds nan") as caught:
+    with pytest.raises(NotFinite, match=r"step 1: network\.verdict\.bias holds NaN") as caught:
         train_made_tracker(options)
     assert str(caught.value).endswith("give the same command again with --rate 0.001")
     spoiling(4)  # The last one.

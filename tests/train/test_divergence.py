@@ -340,7 +340,7 @@ INJECTIONS: dict[str, Injection] = {
     ),
     "frame: gain": Injection(
         _in_frames(lambda f: replace(f, gain=torch.tensor([1.0, NAN, 1.0]))),
-        "frame 000001 .*gain holds nan",
+        "frame 000001 .*gain holds NaN",
     ),
     "frame: focal length": Injection(
         _in_frames(lambda f: _camera(f, focal=(NAN, 80.0))), "frame 000001 .*camera.focal.0"
@@ -353,7 +353,7 @@ INJECTIONS: dict[str, Injection] = {
         "frame 000001 .*camera_from_world",
     ),
     "capture: shape coefficients": Injection(_spoilt_coefficients, "first step: avatar.coefficie"),
-    "file: prior": Injection(lambda _: None, "encoder.input.weight holds nan", prior=True),
+    "file: prior": Injection(lambda _: None, "encoder.input.weight holds NaN", prior=True),
     # Before the first step.
     "registration: shape coefficients": Injection(
         _after_stage("register_training", lambda a, *_: _put(a.coefficients, NAN)),
@@ -374,7 +374,7 @@ INJECTIONS: dict[str, Injection] = {
         is_whole=True,
     ),
     "outlines: gradient": Injection(
-        _shape_gradient, "outlines: avatar.shape.mlp.* holds nan", is_whole=True
+        _shape_gradient, "outlines: avatar.shape.mlp.* holds NaN", is_whole=True
     ),
     "outlines: loss": Injection(
         _result(outlines, "silhouette_loss", NAN), "outlines, step 1: silhouette", is_whole=True
@@ -396,7 +396,7 @@ INJECTIONS: dict[str, Injection] = {
     ),
     "occupancy: gradient of the last step": Injection(
         _gradients_of(loop, "fit_occupancy", call=2),
-        "occupancy: avatar.occupancy.decoder.* holds nan",
+        "occupancy: avatar.occupancy.decoder.* holds NaN",
         is_whole=True,
     ),
     "occupancy: decoder": Injection(
@@ -409,7 +409,7 @@ INJECTIONS: dict[str, Injection] = {
     ),
     "border: gradient of the last step": Injection(
         _gradients_of(loop, "fit_border", call=2),
-        "border: avatar.occupancy.decoder.* holds nan",
+        "border: avatar.occupancy.decoder.* holds NaN",
         is_whole=True,
     ),
     "border: decoder": Injection(
@@ -444,24 +444,24 @@ INJECTIONS: dict[str, Injection] = {
         _after_step(2, _weight("avatar.illumination.wrist_reference")), "step 2: .*wrist_reference"
     ),
     "warm step: loss": Injection(
-        _result(loop, "appearance_loss", NAN), "step 1: loss.color is nan"
+        _result(loop, "appearance_loss", NAN), "step 1: loss.color is NaN"
     ),
-    "warm step: gradient": Injection(_gradient_in_step(2, "adam"), "step 2: avatar.* holds nan"),
+    "warm step: gradient": Injection(_gradient_in_step(2, "adam"), "step 2: avatar.* holds NaN"),
     "warm step: muon's gradient": Injection(
-        _gradient_in_step(3, "muon"), "step 3: avatar.* holds nan"
+        _gradient_in_step(3, "muon"), "step 3: avatar.* holds NaN"
     ),
     "warm step: adam": Injection(
-        _after_step(2, _state("adam", "exp_avg", NAN)), r"step 2: adam.\d+.exp_avg holds nan"
+        _after_step(2, _state("adam", "exp_avg", NAN)), r"step 2: adam.\d+.exp_avg holds NaN"
     ),
     "warm step: muon": Injection(
-        _after_step(1, _state("muon", "momentum_buffer", NAN)), "step 2: avatar.* holds nan"
+        _after_step(1, _state("muon", "momentum_buffer", NAN)), "step 2: avatar.* holds NaN"
     ),
     # Joint steps.
     "joint step: decoder": Injection(_after_step(4, _weight(DECODER, INF)), f"step 4: {DECODER}"),
     "joint step: pose": Injection(
         _after_step(5, _weight(POSE)), f"step 5: {POSE}", is_tracked=True
     ),
-    "joint step: loss": Injection(_result(loop, "color_loss", NAN), "step 4: loss.color is nan"),
+    "joint step: loss": Injection(_result(loop, "color_loss", NAN), "step 4: loss.color is NaN"),
     "joint step: adam's squares": Injection(
         _after_step(4, _state("adam", "exp_avg_sq", INF)), r"step 4: adam.\d+.exp_avg_sq holds inf"
     ),
@@ -471,18 +471,18 @@ INJECTIONS: dict[str, Injection] = {
     "last step: place": Injection(
         _after_step(6, _weight(PLACE, INF)), f"step 6: {PLACE}", is_tracked=True
     ),
-    "last step: gradient": Injection(_gradient_in_step(6, "adam"), "step 6: avatar.* holds nan"),
+    "last step: gradient": Injection(_gradient_in_step(6, "adam"), "step 6: avatar.* holds NaN"),
     "last step: adam": Injection(
-        _after_step(6, _state("adam", "exp_avg_sq", NAN)), r"step 6: adam.\d+.exp_avg_sq holds nan"
+        _after_step(6, _state("adam", "exp_avg_sq", NAN)), r"step 6: adam.\d+.exp_avg_sq holds NaN"
     ),
     "last step: muon": Injection(
         _after_step(6, _state("muon", "momentum_buffer", NAN)), r"step 6: muon.\d+.momentum_buffer"
     ),
     "last step: learning rate": Injection(
-        _after_step(6, _rate), "step 6: state.adam.param_groups.0.initial_lr is nan"
+        _after_step(6, _rate), "step 6: state.adam.param_groups.0.initial_lr is NaN"
     ),
     # After the last step.
-    "detail: unwrapped": Injection(_unwrapped, "detail, step 1: loss is nan", method=DETAILED),
+    "detail: unwrapped": Injection(_unwrapped, "detail, step 1: loss is NaN", method=DETAILED),
     "detail: texels": Injection(
         _after_stage("learn_detail", _texels), "detail: avatar.texture.texels", method=DETAILED
     ),

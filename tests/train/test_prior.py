@@ -103,14 +103,14 @@ def test_a_prior_with_nan_is_neither_written_nor_read(
     with torch.no_grad():
         field.encoder.input.weight[3, 2] = float("nan")
     with pytest.raises(
-        NotFinite, match=r"a: not saved: encoder\.input\.weight holds nan at \[3, 2\]"
+        NotFinite, match=r"a: not saved: encoder\.input\.weight holds NaN at \[3, 2\]"
     ):
         save_prior(field, _options(tmp_path / "a"), rig, 2)
     assert (tmp_path / "a").read_bytes() == before
     with monkeypatch.context() as older:
         older.setattr(prior, "require_finite", lambda *_: None)
         save_prior(field, _options(tmp_path / "a"), rig, 2)
-    with pytest.raises(CheckpointError, match=r"encoder\.input\.weight holds nan at \[3, 2\]"):
+    with pytest.raises(CheckpointError, match=r"encoder\.input\.weight holds NaN at \[3, 2\]"):
         load_prior(PairOccupancy(), tmp_path / "a")
 
 

@@ -425,7 +425,7 @@ def test_a_checkpoint_with_nan_is_not_written_and_the_one_before_stays(
     tensors = _tensors(4)
     name = {"model": "layer.weight", "optimizer": "0.exp_avg"}[stem]
     tensors[stem][name][2, 1] = float("nan")
-    with pytest.raises(NotFinite, match=rf"of step 4: {stem}\.{name} holds nan at \[2, 1\]"):
+    with pytest.raises(NotFinite, match=rf"of step 4: {stem}\.{name} holds NaN at \[2, 1\]"):
         save_checkpoint(run, 4, tensors, {"step": 4, "rate": 0.1})
     _assert_holds(run, 3)
     assert [path.name for path in run.checkpoints.iterdir()] == ["step-000000003"]
@@ -447,7 +447,7 @@ def test_a_checkpoint_that_an_older_version_wrote_with_nan_is_put_aside(
         else:
             state["rate"] = float("nan")
         checkpoint = save_checkpoint(run, 4, tensors, state)
-    what = {"model": r"model\.layer\.weight holds inf at \[0, 0\]", "state": r"state\.rate is nan"}
+    what = {"model": r"model\.layer\.weight holds inf at \[0, 0\]", "state": r"state\.rate is NaN"}
     with pytest.raises(CheckpointError, match=f"cannot be gone on from: {what[file]}"):
         load_checkpoint(checkpoint)
     _assert_holds(run, 3)

@@ -36,7 +36,7 @@ def find_not_finite(values: Mapping[str, object]) -> str | None:
             values, texts and None are always finite.
 
     Returns:
-        Such as ``adam.3.exp_avg holds nan at [0, 4] (2 of 128 values are not finite)``; None if
+        Such as ``adam.3.exp_avg holds NaN at [0, 4] (2 of 128 values are not finite)``; None if
         all are finite.
     """
     tensors = [value for value in values.values() if isinstance(value, Tensor)]
@@ -82,12 +82,16 @@ def _found_in(name: str, value: object) -> str | None:
     if isinstance(value, Tensor):
         return _found_in_tensor(name, value)
     if isinstance(value, float):
-        return None if math.isfinite(value) else f"{name} is {value}"
+        return None if math.isfinite(value) else f"{name} is {_named(value)}"
     if isinstance(value, Mapping):
         return find_not_finite({f"{name}.{key}": item for key, item in value.items()})
     if isinstance(value, list | tuple):
         return find_not_finite({f"{name}.{number}": item for number, item in enumerate(value)})
     return None
+
+
+def _named(value: object) -> str:
+    return str(value).replace("nan", "NaN")
 
 
 def _found_in_tensor(name: str, value: Tensor) -> str | None:
@@ -100,6 +104,6 @@ def _found_in_tensor(name: str, value: Tensor) -> str | None:
     where = places[0].tolist()
     at = f" at {where}" if where else ""
     return (
-        f"{name} holds {value[tuple(where)].item()}{at} "
+        f"{name} holds {_named(value[tuple(where)].item())}{at} "
         f"({len(places)} of {value.numel()} values are not finite)"
     )
