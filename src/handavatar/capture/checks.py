@@ -5,6 +5,7 @@ Every check raises :class:`CaptureError` with what was found and what to do; cal
 
 import json
 import math
+import struct
 from io import BytesIO
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -15,6 +16,8 @@ from PIL import Image
 MAX_JSON_BYTES = 64 * 2**20
 MAX_PIXELS = 64_000_000
 MAX_TEXT = 2000
+_ORIENTATION = 0x0112
+"""Tag of EXIF; 1 is upright, and so is 0, which some programs write for not knowing."""
 
 
 class CaptureError(ValueError):
@@ -183,6 +186,23 @@ def picture_in(
             f"{name} is {width} x {height}, more than {megapixels} megapixels", "make it smaller"
         )
     return picture
+
+
+def is_to_be_turned(picture: Image.Image) -> bool:
+    """Whether the header of an opened picture asks for another orientation than its pixels have.
+
+    Args:
+        picture: as :func:`open_picture` gives it; no pixel is decoded.
+    """
+    stored = picture.info.get("exif")
+    if not isinstance(stored, bytes):
+        return False
+    exif = Image.Exif()
+    try:
+        exif.load(stored)
+        return exif.get(_ORIENTATION, 1) not in (0, 1)
+    except (OSError, ValueError, SyntaxError, KeyError, TypeError, struct.error):
+        return False  # What cannot be read asks for nothing.
 
 
 def decoded(picture: Image.Image, name: str, mode: str = "") -> np.ndarray:

@@ -168,11 +168,15 @@ class _CheckOptions:
 
 def check(words: list[str]) -> int:
     """Validate a capture: every problem with file, frame and remedy."""
-    from handavatar.capture.frames import find_problems
+    from handavatar.capture.soundness import find_problems
     from handavatar.cli.arguments import JSON, parse_with, print_json
+    from handavatar.train.progress import Progress
 
     options, extras = parse_with(_CheckOptions, (JSON,), words, "capture check", ("capture",))
-    problems = find_problems(options.capture)
+    with Progress("capture check", 100) as progress:
+        problems = find_problems(
+            options.capture, lambda done, total: progress.update(100 * done // total)
+        )
     if extras["json"]:
         print_json({"sound": not problems, "problems": [vars(problem) for problem in problems]})
     else:
