@@ -205,6 +205,48 @@ def test_a_slip_is_named(
     assert "mistake" not in captured.err and sorted(place.rglob("*")) == before
 
 
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        ("render RUN --device mps", 2, "--device mps: expected auto, cpu, cuda"),
+        ("render RUN --device gpu", 2, "--device gpu: expected auto, cpu, cuda"),
+        ("view RUN --device cuda:x", 2, "--device cuda:x: expected"),
+        ("render RUN --device cuda:99", 2, "--device cuda:99: (no CUDA device|torch sees)"),
+        ("capture video video.mp4 --out O --fps 0", 2, "--fps 0: expected"),
+        ("capture video video.mp4 --out O --max-frames 0", 2, "--max-frames 0: expected"),
+        ("edit RUN --out O --light-gain -1", 2, "--light-gain and --albedo-shift: expected"),
+        ("capture degrade captures/capture --out .", 3, "the command was started in"),
+        ("render RUN --out .", 2, "the command was started in"),
+        ("train captures/capture --steps 0", 2, "--steps 0: expected at least 1"),
+    ],
+)
+def test_a_value_that_makes_no_sense_is_named(
+    words: str,
+    code: int,
+    says: str,
+    place: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(place)
+    assert cli.main([{"RUN": RUN}.get(word, word) for word in words.split()]) == code
+    shown = capsys.readouterr().err
+    assert re.search(says, shown), shown
+    assert "mistake" not in shown
+
+
+@pytest.mark.parametrize("value", ["2", "two", "0"])
+def test_an_environment_of_several_processes_that_nobody_started_is_named(
+    value: str, place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(place)
+    monkeypatch.setenv("WORLD_SIZE", value)
+    assert cli.main(["render", RUN, "--out", "pictures", "--size", "16", "--frames", "1"]) == 3
+    shown = capsys.readouterr().err
+    assert f"WORLD_SIZE={value}" in shown and "unset WORLD_SIZE" in shown
+    assert not (place / "pictures").exists()
+
+
 def test_every_path_that_a_command_reads_is_asked_first_what_it_is(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -8,6 +8,7 @@ ray; training and rendering go through the same two calls.
 import copy
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -87,13 +88,25 @@ def _stored_edit(about: dict[str, Any], tensors: dict[str, Tensor]) -> Edit:
 def chosen_device(name: str) -> torch.device:
     """``auto`` is CUDA where there is one.
 
+    Args:
+        name: ``auto``, ``cpu``, ``cuda``, or one of several GPUs such as ``cuda:1``.
+
     Raises:
-        ValueError: if ``cuda`` is asked for and there is none.
+        ValueError: there is no such device, or it is of a kind that nothing here runs on.
     """
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda: no CUDA device is visible to torch; use --device cpu")
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
+        name = "cuda" if count else "cpu"
+    found = re.fullmatch(r"cpu|cuda(?::(\d{1,3}))?", name)
+    if found is None:
+        raise ValueError(
+            f"--device {name[:20]}: expected auto, cpu, cuda, or cuda:N for one of several GPUs "
+            "(NVIDIA's; on others use cpu)"
+        )
+    if name != "cpu" and not count:
+        raise ValueError(f"--device {name}: no CUDA device is visible to torch; use --device cpu")
+    if found[1] and int(found[1]) >= count:
+        raise ValueError(f"--device {name}: torch sees {count}, cuda:0 to cuda:{count - 1}")
     return torch.device(name)
 
 
