@@ -85,6 +85,13 @@ def _stored_edit(about: dict[str, Any], tensors: dict[str, Tensor]) -> Edit:
     )
 
 
+_MAX_BYTES = 1 << 30
+"""Of an avatar file; 10 to 100 MB are usual."""
+_MAX_DIRECTIONS = 1024
+_MAX_LIGHTS = 64
+"""More columns than that are no network of ours, and do not fit it."""
+
+
 def chosen_device(name: str) -> torch.device:
     """``auto`` is CUDA where there is one.
 
@@ -934,6 +941,8 @@ class HandAvatar(nn.Module):
             state = {name[7:]: v for name, v in tensors.items() if name.startswith("avatar.")}
             anchors = SurfacePoints(state["anchor_corners"], state["anchor_barycentric"])
             cues = cue_set(about["cues"], len(state["illumination.directions"]))
+            if len(state["illumination.directions"]) > _MAX_DIRECTIONS:
+                raise ValueError(f"more than {_MAX_DIRECTIONS} directions of light")
             columns = state["illumination.mlp.hidden.0.weight"].shape[1] - cues.width
             avatar = HandAvatar(
                 rig,
@@ -941,7 +950,7 @@ class HandAvatar(nn.Module):
                 rounds=about["rounds"],
                 anchors=anchors,
                 cues=cues,
-                num_lights=max(columns, 1),
+                num_lights=min(max(columns, 1), _MAX_LIGHTS),
             )
             avatar._restore(about, tensors)
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -1000,6 +1009,11 @@ def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         path = path / "avatar.safetensors"
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file; train an avatar or name an existing one")
+    if path.stat().st_size > _MAX_BYTES:
+        raise CheckpointError(
+            f"{path}: {path.stat().st_size / 2**30:.1f} GiB; avatars have at most "
+            f"{_MAX_BYTES / 2**30:.0f}: it is another file"
+        )
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {}).get("handavatar", "null"))

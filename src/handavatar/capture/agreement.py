@@ -19,6 +19,8 @@ from handavatar.render.rasterize import covered_pixels
 
 _HAND_PIXELS = 48
 """Along a hand in the small pictures: a finger is about five wide."""
+_SAMPLES = 8
+"""Stored pixels in a row that make one of a small picture, at most about twice as many."""
 _SIDES = (64, 256)
 """Of the small pictures, pixels along the longer side: at least, at most."""
 
@@ -92,10 +94,15 @@ def small_frame(frame: Frame, hand: ShapedHand, side: int) -> SmallFrame:
     """
     camera = small_camera(frame.camera, side)
     size = (camera.height, camera.width)
+    # Of large pictures a few pixels for each small one tell enough.
+    step = max(1, max(frame.camera.width, frame.camera.height) // (_SAMPLES * side))
+    image, coverage, known = (
+        each[::step, ::step] for each in (frame.image, frame.coverage, frame.known)
+    )
     mesh = covered_pixels(hand.posed(frame.pose).vertices, hand.rig.faces, camera)
-    known = _resized(frame.known.float(), size) > 0.999
-    mask = (_resized(frame.alpha, size) >= 0.5) & known
-    colors = _resized(frame.image.float().permute(2, 0, 1) / 255, size)
+    known = _resized(known.float(), size) > 0.999
+    mask = (_resized(coverage.float() / 255, size) >= 0.5) & known
+    colors = _resized(image.float().permute(2, 0, 1) / 255, size)
     room = (0, side - size[1], 0, side - size[0])
     return SmallFrame(
         mask=pad(mask, room),

@@ -63,6 +63,11 @@ Said = TypeVar("Said")
 SCHEMA = 1
 SPLITS = ("train", "val", "test")
 MAX_FRAMES = 100_000
+MAX_CAPTURE_PIXELS = 1_000_000_000
+"""Of all pictures of a capture: 2,000 frames of 512 x 512 have half as many. Whoever learns from
+them may hold them all, five bytes each."""
+_MAX_SIDE_FILE = 1 << 30
+"""Bytes of a file of covariances or landmarks; 10,000 frames have 0.2 GB."""
 MAX_CLIPS = 32
 """Recordings of one hand in a capture."""
 FITTED_SIDE = 256
@@ -383,6 +388,8 @@ class Capture:
         path = self.folder / file
         if not path.is_file():
             return None
+        if path.stat().st_size > _MAX_SIDE_FILE:
+            raise CaptureError(f"{file} has more than {_MAX_SIDE_FILE >> 20} MiB", _MAKE_AGAIN)
         try:
             tensors = load_file(path)
             found = {name: tensors[name].float() for name in shapes}
@@ -482,6 +489,15 @@ def examine_files(folder: Path) -> tuple[Capture | None, list[Problem]]:
         except CaptureError as error:
             file = str(entry.get("file_path", "transforms.json"))[:200] if entry else ""
             problems.append(Problem(file, label, error.what, error.remedy))
+    pixels = sum(record.camera.width * record.camera.height for record in records.values())
+    if pixels > MAX_CAPTURE_PIXELS:
+        what = (
+            f"{len(records)} frames have {pixels / 1e6:,.0f} megapixels together, at most "
+            f"{MAX_CAPTURE_PIXELS / 1e6:,.0f} are read"
+        )
+        problems.append(
+            Problem("transforms.json", "", what, "make the pictures smaller, or leave frames out")
+        )
     return Capture(folder=folder, records=tuple(records.values()), **header), problems
 
 
