@@ -89,7 +89,6 @@ _MAX_BYTES = 1 << 30
 """Of an avatar file; 10 to 100 MB are usual."""
 _MAX_DIRECTIONS = 1024
 _MAX_LIGHTS = 64
-"""More columns than that are no network of ours, and do not fit it."""
 
 
 def chosen_device(name: str) -> torch.device:
@@ -944,13 +943,15 @@ class HandAvatar(nn.Module):
             if len(state["illumination.directions"]) > _MAX_DIRECTIONS:
                 raise ValueError(f"more than {_MAX_DIRECTIONS} directions of light")
             columns = state["illumination.mlp.hidden.0.weight"].shape[1] - cues.width
+            if columns > _MAX_LIGHTS:
+                raise ValueError(f"{columns} lights, at most {_MAX_LIGHTS} make sense")
             avatar = HandAvatar(
                 rig,
                 state["coefficients"],
                 rounds=about["rounds"],
                 anchors=anchors,
                 cues=cues,
-                num_lights=min(max(columns, 1), _MAX_LIGHTS),
+                num_lights=max(columns, 1),
             )
             avatar._restore(about, tensors)
         except (KeyError, RuntimeError, TypeError, ValueError) as error:

@@ -487,7 +487,8 @@ def examine_files(folder: Path) -> tuple[Capture | None, list[Problem]]:
                 )
             records[record.name] = record
         except CaptureError as error:
-            file = str(entry.get("file_path", "transforms.json"))[:200] if entry else ""
+            said = entry.get("file_path") if isinstance(entry, dict) else None
+            file = said[:200] if isinstance(said, str) else "transforms.json"
             problems.append(Problem(file, label, error.what, error.remedy))
     pixels = sum(record.camera.width * record.camera.height for record in records.values())
     if pixels > MAX_CAPTURE_PIXELS:

@@ -86,7 +86,7 @@ def read_tracker(path: Path) -> TrainedTracker:
             header = file.metadata() or {}
         tensors = {name: values.float() for name, values in load_file(path).items()}
         if header.get("schema") != str(SCHEMA):
-            raise TrackerError(f"{path}: is no tracker of schema {SCHEMA}; train it again")
+            raise KeyError(f"schema {SCHEMA}; train it again")
         points = TrackedPoints(
             header["rig_name"],
             header["rig_sha256"],
@@ -95,7 +95,10 @@ def read_tracker(path: Path) -> TrainedTracker:
         )
         network = HandNetwork(len(points))
         network.load_state_dict(tensors, strict=False)
-    except (OSError, SafetensorError, KeyError, json.JSONDecodeError, RuntimeError) as error:
+    except (
+        *(OSError, SafetensorError, KeyError, ValueError, RuntimeError),
+        *(TypeError, OverflowError, RecursionError),
+    ) as error:
         raise TrackerError(f"{path}: cannot be read as a tracker ({error})") from error
     return TrainedTracker(network.eval(), points)
 
