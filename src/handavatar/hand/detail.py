@@ -10,7 +10,7 @@ from handavatar.geometry.meshes import Subdivision, subdivide_midpoint
 from handavatar.hand.rig import Rig, RigError
 from handavatar.hand.sparse_skin import SparseSkin
 
-MAX_FACES = 1_000_000
+_MAX_FACES = 1_000_000
 """Of a subdivided rig: 4 rounds of the open hand are 0.8 million, and each takes 1 kB and more."""
 _SHIPPED = ("skin_full_2.safetensors", "skin_778_2.safetensors")
 """Made with ``handavatar rig refine --level full`` and ``--level 778``."""
@@ -27,15 +27,15 @@ def subdivided(rig: Rig, rounds: int = 2) -> Rig:
         rounds: each multiplies the faces by four; the paper uses two.
 
     Raises:
-        RigError: there would be more than :data:`MAX_FACES`.
+        RigError: there would be more than a million faces.
 
     Source: paper Sec. 3.1. Refined skinning weights are another step: :func:`refined`.
     """
     faces = len(rig.faces)
     # Beyond 16 rounds the very number is not worth working out.
-    if not 0 <= rounds <= 16 or faces * 4**rounds > MAX_FACES:
+    if not 0 <= rounds <= 16 or faces * 4**rounds > _MAX_FACES:
         raise RigError(
-            f"{rounds} rounds of subdivision make more than {MAX_FACES:,} faces of {faces:,} of "
+            f"{rounds} rounds of subdivision make more than {_MAX_FACES:,} faces of {faces:,} of "
             f"{rig.name}\nthe method takes 2"
         )
     for _ in range(rounds):
