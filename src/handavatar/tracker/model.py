@@ -86,7 +86,7 @@ def read_tracker(path: Path) -> TrainedTracker:
             header = file.metadata() or {}
         tensors = {name: values.float() for name, values in load_file(path).items()}
         if header.get("schema") != str(SCHEMA):
-            raise KeyError(f"schema {SCHEMA}; train it again")
+            raise TrackerError(f"{path}: is no tracker of schema {SCHEMA}; train it again")
         points = TrackedPoints(
             header["rig_name"],
             header["rig_sha256"],
@@ -95,6 +95,8 @@ def read_tracker(path: Path) -> TrainedTracker:
         )
         network = HandNetwork(len(points))
         network.load_state_dict(tensors, strict=False)
+    except TrackerError:
+        raise
     except (
         *(OSError, SafetensorError, KeyError, ValueError, RuntimeError),
         *(TypeError, OverflowError, RecursionError),
