@@ -44,9 +44,9 @@ AT_LEAST = {
     "hand.pose": "HandPose.flat",
     "hand.rig": "Rig.shaped ShapedHand.posed",
     "capture.frames": (
-        "Capture Capture.frame Capture.split Frame CaptureWriter find_problems read_capture "
-        "write_capture"
+        "Capture Capture.frame Capture.split Frame CaptureWriter read_capture write_capture"
     ),
+    "capture.soundness": "find_problems require_sound",
     "capture.checks": "CaptureError",
     "capture.motion": (
         "Motion Motion.pose gesture middle_of_hand named_motion open_motion read_motion "

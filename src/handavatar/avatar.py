@@ -8,6 +8,7 @@ ray; training and rendering go through the same two calls.
 import copy
 import json
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
@@ -92,16 +93,34 @@ def _stored_edit(about: dict[str, Any], tensors: dict[str, Tensor]) -> Edit:
     )
 
 
+_MAX_BYTES = 1 << 30
+"""Of an avatar file; 10 to 100 MB are usual."""
+_MAX_DIRECTIONS = 1024
+_MAX_LIGHTS = 64
+
+
 def chosen_device(name: str) -> torch.device:
     """``auto`` is CUDA where there is one.
 
+    Args:
+        name: ``auto``, ``cpu``, ``cuda``, or one of several GPUs such as ``cuda:1``.
+
     Raises:
-        ValueError: if ``cuda`` is asked for and there is none.
+        ValueError: there is no such device, or it is of a kind that nothing here runs on.
     """
-    if name == "cuda" and not torch.cuda.is_available():
-        raise ValueError("--device cuda: no CUDA device is visible to torch; use --device cpu")
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
+        name = "cuda" if count else "cpu"
+    found = re.fullmatch(r"cpu|cuda(?::(\d{1,3}))?", name)
+    if found is None:
+        raise ValueError(
+            f"--device {name[:20]}: expected auto, cpu, cuda, or cuda:N for one of several GPUs "
+            "(NVIDIA's; on others use cpu)"
+        )
+    if name != "cpu" and not count:
+        raise ValueError(f"--device {name}: no CUDA device is visible to torch; use --device cpu")
+    if found[1] and int(found[1]) >= count:
+        raise ValueError(f"--device {name}: torch sees {count}, cuda:0 to cuda:{count - 1}")
     return torch.device(name)
 
 
@@ -939,7 +958,11 @@ class HandAvatar(nn.Module):
             state = {name[7:]: v for name, v in tensors.items() if name.startswith("avatar.")}
             anchors = SurfacePoints(state["anchor_corners"], state["anchor_barycentric"])
             cues = cue_set(about["cues"], len(state["illumination.directions"]))
+            if len(state["illumination.directions"]) > _MAX_DIRECTIONS:
+                raise ValueError(f"more than {_MAX_DIRECTIONS} directions of light")
             columns = state["illumination.mlp.hidden.0.weight"].shape[1] - cues.width
+            if columns > _MAX_LIGHTS:
+                raise ValueError(f"{columns} lights, at most {_MAX_LIGHTS} make sense")
             avatar = HandAvatar(
                 rig,
                 state["coefficients"],
@@ -1012,6 +1035,11 @@ def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         path = path / "avatar.safetensors"
     if not path.is_file():
         raise CheckpointError(f"{path}: no such file; train an avatar or name an existing one")
+    if path.stat().st_size > _MAX_BYTES:
+        raise CheckpointError(
+            f"{path}: {path.stat().st_size / 2**30:.1f} GiB; avatars have at most "
+            f"{_MAX_BYTES / 2**30:.0f}: it is another file"
+        )
     try:
         with safe_open(path, framework="pt") as file:
             about = json.loads((file.metadata() or {}).get("handavatar", "null"))

@@ -8,6 +8,12 @@ from dataclasses import dataclass
 import torch
 import torch.distributed
 
+_OF_TORCHRUN = ("RANK", "MASTER_ADDR", "MASTER_PORT")
+
+
+class ProcessesError(ValueError):
+    """An environment that speaks of several processes, but does not say where they are."""
+
 
 @dataclass(frozen=True)
 class Processes:
@@ -46,14 +52,32 @@ def is_first_process() -> bool:
     return os.environ.get("RANK", "0") == "0"
 
 
+def _count() -> int:
+    """How many processes ``torchrun`` started; 1 if it did not."""
+    said = os.environ.get("WORLD_SIZE", "1")
+    if said == "1":
+        return 1
+    missing = [name for name in _OF_TORCHRUN if name not in os.environ]
+    if missing or not said.isascii() or not said.isdigit() or int(said) < 1:
+        raise ProcessesError(
+            f"the environment says WORLD_SIZE={said[:20]}, as torchrun sets it, but "
+            + (f"not {', '.join(missing)}" if missing else "that is no count of processes")
+            + "\nto work alone: unset WORLD_SIZE; to work together: start it with torchrun"
+        )
+    return int(said)
+
+
 @contextmanager
 def joined_processes(device: str) -> Iterator[Processes]:
     """Joins the processes that ``torchrun`` started; alone if it did not.
 
     Args:
         device: ``cpu``; or ``cuda``, of which every process on a machine takes another one.
+
+    Raises:
+        ProcessesError: the environment speaks of several processes that torchrun did not start.
     """
-    count = int(os.environ.get("WORLD_SIZE", "1"))
+    count = _count()
     if count == 1:
         yield Processes(0, 1, device)
         return

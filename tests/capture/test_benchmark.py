@@ -13,7 +13,8 @@ from handavatar.capture.benchmark import (
     synth_options,
 )
 from handavatar.capture.checks import CaptureError
-from handavatar.capture.frames import find_problems, read_capture
+from handavatar.capture.frames import read_capture
+from handavatar.capture.soundness import find_problems
 from handavatar.jobs.files import MARKER
 
 

@@ -11,8 +11,9 @@ from scipy.ndimage import distance_transform_edt
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.degraded import DegradeOptions, degrade_capture
-from handavatar.capture.frames import find_problems, read_capture
+from handavatar.capture.frames import read_capture
 from handavatar.capture.motion import read_motion
+from handavatar.capture.soundness import find_problems
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 
 

@@ -8,7 +8,8 @@ from PIL import Image, ImageDraw
 from safetensors.torch import load_file
 
 from handavatar.capture.default import default_capture
-from handavatar.capture.frames import CaptureError, find_problems
+from handavatar.capture.frames import CaptureError
+from handavatar.capture.soundness import find_problems
 from handavatar.capture.synthetic import (
     SynthOptions,
     crop_camera,

@@ -21,7 +21,7 @@ from handavatar.capture.clips import FittedHands
 from handavatar.capture.fitted_frames import Box, stored_size
 from handavatar.capture.fitted_hand import HandModel
 from handavatar.capture.fitting import FitOptions
-from handavatar.capture.frames import find_problems
+from handavatar.capture.soundness import find_problems
 from handavatar.capture.tracking import Glance, Track
 from handavatar.capture.video import VideoOptions, capture_video, track_video
 from handavatar.capture.video_report import TriedClip, held_out_splits, summary_lines

@@ -5,6 +5,7 @@ Every check raises :class:`CaptureError` with what was found and what to do; cal
 
 import json
 import math
+from collections import Counter
 from io import BytesIO
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,8 +14,13 @@ import numpy as np
 from PIL import Image
 
 MAX_JSON_BYTES = 64 * 2**20
+MAX_JSON_CONTAINERS = 4_000_000
+"""Lists and objects: each takes 60 bytes and more, of three in the file. A motion of 100,000 steps
+has 1.7 million, a capture of as many frames 2.5."""
 MAX_PIXELS = 64_000_000
 MAX_TEXT = 2000
+_ORIENTATION = 0x0112
+"""Tag of EXIF; 1 is upright, and so is 0, which some programs write for not knowing."""
 
 
 class CaptureError(ValueError):
@@ -48,9 +54,17 @@ def load_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
             f"{path.name} has {path.stat().st_size} bytes, at most {max_bytes} are read",
             "split the recording into several captures",
         )
+    text = path.read_bytes()
+    containers = text.count(b"[") + text.count(b"{")
+    if containers > MAX_JSON_CONTAINERS:
+        raise CaptureError(
+            f"{path.name} has {containers} lists and objects, at most {MAX_JSON_CONTAINERS} are "
+            "read",
+            "split the recording into several captures or motions",
+        )
     try:
         content = json.loads(
-            path.read_bytes().decode("utf-8"),
+            text.decode("utf-8"),
             parse_constant=_refuse_constant,
             object_pairs_hook=_unique_keys,
         )
@@ -71,8 +85,7 @@ def _refuse_constant(text: str) -> float:
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content = dict(pairs)
     if len(content) != len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for name in names if names.count(name) > 1)
+        (twice, _), *_rest = Counter(name for name, _ in pairs).most_common(1)
         raise ValueError(f"the key {twice[:80]!r} appears twice")
     return content
 
@@ -171,7 +184,9 @@ def picture_in(
         raise CaptureError(
             f"{name} claims more than {megapixels} megapixels", "make it smaller"
         ) from error
-    except (OSError, ValueError, SyntaxError) as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # Of whatever kind, as in :func:`decoded`.
         kinds = " or ".join(formats)
         raise CaptureError(
             f"{name} is not a {kinds} that can be read", f"save it again as {formats[0]}"
@@ -183,6 +198,23 @@ def picture_in(
             f"{name} is {width} x {height}, more than {megapixels} megapixels", "make it smaller"
         )
     return picture
+
+
+def is_to_be_turned(picture: Image.Image) -> bool:
+    """Whether the header of an opened picture asks for another orientation than its pixels have.
+
+    Args:
+        picture: as :func:`open_picture` gives it; no pixel is decoded.
+    """
+    stored = picture.info.get("exif")
+    if not isinstance(stored, bytes):
+        return False
+    exif = Image.Exif()
+    try:
+        exif.load(stored)
+        return exif.get(_ORIENTATION, 1) not in (0, 1)
+    except Exception:  # Of whatever kind: what cannot be read asks for nothing.
+        return False
 
 
 def decoded(picture: Image.Image, name: str, mode: str = "") -> np.ndarray:
@@ -199,7 +231,9 @@ def decoded(picture: Image.Image, name: str, mode: str = "") -> np.ndarray:
     try:
         with picture:
             return np.array(picture.convert(mode) if mode else picture)
-    except (OSError, ValueError, SyntaxError) as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # Of whatever kind: decoders stumble over damage in many ways.
         raise CaptureError(
             f"{name} is damaged: {str(error)[:120]}", "restore the file, or drop the frame"
         ) from error

@@ -95,18 +95,17 @@ def degrade_capture(folder: Path, options: DegradeOptions, overwrite: bool = Fal
         inputs=(source.folder,),
     )
     with writer:
-        frames = [source.frame(index) for index in range(len(source.records))]
         noise = _PoseNoise(options, random)
-        for frame in frames:
-            writer.add(_degraded(frame, options, noise))
+        for index in range(len(source.records)):
+            writer.add(_degraded(source.frame(index), options, noise))
         if (source.folder / "truth").is_dir():
             shutil.copytree(
                 source.folder / "truth", writer.file("truth/poses.json").parent, dirs_exist_ok=True
             )
         motion = Motion(
             1.0,
-            torch.stack([frame.pose.rotations for frame in frames]),
-            torch.stack([frame.pose.translation for frame in frames]),
+            torch.stack([record.pose.rotations for record in source.records]),
+            torch.stack([record.pose.translation for record in source.records]),
         )
         write_motion(writer.file("truth/poses.json"), motion)
         # Its name and not where it lies: the same bits wherever they are made.

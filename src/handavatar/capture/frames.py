@@ -35,6 +35,7 @@ from torch import Tensor
 from handavatar.capture.checks import (
     CaptureError,
     decoded,
+    is_to_be_turned,
     load_json,
     number,
     numbers,
@@ -63,6 +64,11 @@ Said = TypeVar("Said")
 SCHEMA = 1
 SPLITS = ("train", "val", "test")
 MAX_FRAMES = 100_000
+MAX_CAPTURE_PIXELS = 1_000_000_000
+"""Of all pictures of a capture: 2,000 frames of 512 x 512 have half as many. Whoever learns from
+them may hold them all, five bytes each."""
+_MAX_SIDE_FILE = 1 << 30
+"""Bytes of a file of covariances or landmarks; 10,000 frames have 0.2 GB."""
 MAX_CLIPS = 32
 """Recordings of one hand in a capture."""
 FITTED_SIDE = 256
@@ -401,6 +407,8 @@ class Capture:
         path = self.folder / file
         if not path.is_file():
             return None
+        if path.stat().st_size > _MAX_SIDE_FILE:
+            raise CaptureError(f"{file} has more than {_MAX_SIDE_FILE >> 20} MiB", _MAKE_AGAIN)
         try:
             tensors = load_file(path)
             found = {name: tensors[name].float() for name in shapes}
@@ -444,7 +452,7 @@ def read_capture(folder: Path) -> Capture:
     Raises:
         CaptureError: the first problem, with file, frame and remedy.
     """
-    capture, problems = _examined(Path(folder))
+    capture, problems = examine_files(Path(folder))
     if problems or capture is None:
         more = (
             f"\nand {len(problems) - 1} more: handavatar capture check {folder}"
@@ -453,22 +461,6 @@ def read_capture(folder: Path) -> Capture:
         )
         raise CaptureError(f"{folder}\n{problems[0]}{more}")
     return capture
-
-
-def find_problems(folder: Path) -> list[Problem]:
-    """Everything wrong with a capture folder, pixels included; empty if it is sound."""
-    capture, problems = _examined(Path(folder))
-    for index, record in enumerate(capture.records if capture else ()):
-        try:
-            frame = capture.frame(index)  # type: ignore[union-attr]
-        except CaptureError as error:
-            problems.append(Problem(record.file_path, record.name, error.what, error.remedy))
-            continue
-        if not bool(frame.mask.any()):
-            problems.append(
-                Problem(record.mask_path, record.name, "the mask is empty", "drop the frame")
-            )
-    return problems
 
 
 def opencv_from_opengl(world_from_camera: np.ndarray) -> Float[Tensor, "4 4"]:
@@ -483,8 +475,12 @@ def opengl_from_opencv(camera_from_world: Float[Tensor, "4 4"]) -> np.ndarray:
     return world_from_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def _examined(folder: Path) -> tuple[Capture | None, list[Problem]]:
-    """The capture as far as it can be read, and all problems that show without decoding."""
+def examine_files(folder: Path) -> tuple[Capture | None, list[Problem]]:
+    """The capture as far as it can be read, and all problems that show without decoding.
+
+    Args:
+        folder: of the capture.
+    """
     try:
         content = load_json(folder / "transforms.json")
         header = _header(content)
@@ -510,8 +506,18 @@ def _examined(folder: Path) -> tuple[Capture | None, list[Problem]]:
                 )
             records[record.name] = record
         except CaptureError as error:
-            file = str(entry.get("file_path", "transforms.json"))[:200] if entry else ""
+            said = entry.get("file_path") if isinstance(entry, dict) else None
+            file = said[:200] if isinstance(said, str) else "transforms.json"
             problems.append(Problem(file, label, error.what, error.remedy))
+    pixels = sum(record.camera.width * record.camera.height for record in records.values())
+    if pixels > MAX_CAPTURE_PIXELS:
+        what = (
+            f"{len(records)} frames have {pixels / 1e6:,.0f} megapixels together, at most "
+            f"{MAX_CAPTURE_PIXELS / 1e6:,.0f} are read"
+        )
+        problems.append(
+            Problem("transforms.json", "", what, "make the pictures smaller, or leave frames out")
+        )
     return Capture(folder=folder, records=tuple(records.values()), **header), problems
 
 
@@ -594,9 +600,11 @@ def _record(
     translation = numbers(hand.get("translation"), (3,), "translation")
     transform = camera.camera_from_world.double().numpy()
     depth = float(transform[2, :3] @ translation + transform[2, 3])
+    far = float(np.linalg.norm(translation))
     if not 0 < depth < 100:
         raise CaptureError(
-            f"the wrist lies {depth:.3g} m in front of the camera, expected 0 to 100",
+            f"the wrist lies {depth:.3g} m in front of the camera, expected 0 to 100"
+            + (", and the hand's translation looks like millimetres" if far > 3 else ""),
             "write metres, and transform_matrix as camera-to-world in OpenGL axes",
         )
     return FrameRecord(
@@ -675,6 +683,11 @@ def _size_of_picture(path: Path, modes: tuple[str, ...]) -> tuple[int, int]:
             raise CaptureError(
                 f"{path.name} has channels {picture.mode}, expected {' or '.join(modes)}",
                 "save pictures as 8-bit RGB without alpha, masks as 8-bit grey",
+            )
+        if is_to_be_turned(picture):
+            raise CaptureError(
+                f"{path.name} says that it is to be turned or mirrored before it is shown (EXIF)",
+                "turn its pixels as mask, camera and pose have them, and save it without that tag",
             )
         return picture.size
 

@@ -17,13 +17,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from handavatar.capture.checks import CaptureError, load_json, number, numbers
+from handavatar.capture.checks import CaptureError, load_json, number
+from handavatar.capture.motion_values import MAX_STEPS, rotations_of, translations_of
 from handavatar.geometry.rotations import (
     axis_angle_from_matrix,
     matrix_from_axis_angle,
     rotations_between,
 )
-from handavatar.hand.pose import NUM_BONES, HandPose
+from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import (
     GESTURES,
     Gesture,
@@ -37,7 +38,6 @@ from handavatar.jobs.finite import find_not_finite
 SCHEMA = 1
 LONG_GAP = 0.75
 """Seconds without a pose that are told."""
-MAX_STEPS = 100_000
 
 _OPEN = (0.0, 3.0, 1.0, 0.0)
 _BENT = (82.0, 90.0, 42.0, 0.0)
@@ -204,21 +204,12 @@ def read_motion(path: Path) -> Motion:
                 f"schema is {str(content.get('schema'))[:20]}, this program reads {SCHEMA}",
                 'write "schema": 1, or update handavatar',
             )
-        steps = content.get("rotations")
-        if not isinstance(steps, list) or not 0 < len(steps) <= MAX_STEPS:
-            raise CaptureError(
-                f"rotations is not a list of 1 to {MAX_STEPS} steps", "give a pose per step"
-            )
-        rotations = torch.from_numpy(numbers(steps, (len(steps), NUM_BONES, 3), "rotations"))
-        if float(rotations.norm(dim=-1).max()) > 2 * math.pi + 1e-3:
-            raise CaptureError(
-                "a joint turns by more than a full circle", "write radians, not degrees"
-            )
-        translations = numbers(content.get("translations"), (len(steps), 3), "translations")
         fps = number(content.get("fps"), "fps", 0.01, 1000.0)
+        rotations = rotations_of(content.get("rotations"))
+        translations = translations_of(content.get("translations"), len(rotations), fps)
     except CaptureError as error:
         raise CaptureError(f"{path}: {error.what}", error.remedy) from error
-    return Motion(fps, rotations.float(), torch.from_numpy(translations).float())
+    return Motion(fps, rotations.float(), translations.float())
 
 
 def write_motion(path: Path, motion: Motion) -> None:

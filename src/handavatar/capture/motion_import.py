@@ -11,11 +11,12 @@ import torch
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import Tell
 from handavatar.capture.frames import Capture, read_capture
-from handavatar.capture.motion import MAX_STEPS, Motion, evenly_spaced
+from handavatar.capture.motion import Motion, evenly_spaced
 from handavatar.capture.motion_files.conversion import motion_of_file
 from handavatar.capture.motion_files.stored import is_motion_file
 from handavatar.capture.motion_files.track import Conventions, LayoutName
 from handavatar.capture.motion_files.trackers import is_hawor
+from handavatar.capture.motion_values import MAX_STEPS
 from handavatar.capture.tracking import has_mediapipe
 from handavatar.capture.video import VideoOptions, capture_video
 from handavatar.geometry.rotations import matrix_from_axis_angle

@@ -182,7 +182,9 @@ def _read(file: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 
             picture = Image.fromarray(levels.round().clip(0, 255).astype(np.uint8))
         upright = ImageOps.exif_transpose(picture)
         colored = _srgb(upright, profile)
-    except (OSError, ValueError, SyntaxError, IndexError) as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # Of whatever kind: decoders stumble over damage in many ways.
         raise CaptureError(
             f"{file} is damaged: {str(error)[:120]}", "restore the file, or leave it out"
         ) from error

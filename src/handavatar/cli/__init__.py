@@ -8,6 +8,7 @@ import difflib
 import os
 import sys
 from collections.abc import Callable, Sequence
+from io import TextIOWrapper
 
 from handavatar import __version__
 from handavatar.cli import avatar, bench, capture, default, motion, prior, rig, tracker
@@ -55,6 +56,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Read when CUDA starts; without it matrix products on a GPU are not repeatable.
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    for stream in (sys.stdout, sys.stderr):
+        # Names of files may hold what is no character: shown as codes, never an error.
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     is_debugging = "--debug" in words
     words = [word for word in words if word != "--debug"]
     if words[:1] == ["--version"]:

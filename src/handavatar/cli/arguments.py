@@ -10,6 +10,8 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
+from handavatar.cli.inputs import Expected, require
+
 Options = TypeVar("Options")
 
 
@@ -38,7 +40,11 @@ OVERWRITE = Extra("overwrite", bool, "replace what lies there", False)
 
 
 def parse(
-    options: type[Options], words: list[str], command: str, positional: tuple[str, ...] = ()
+    options: type[Options],
+    words: list[str],
+    command: str,
+    positional: tuple[str, ...] = (),
+    reads: Mapping[str, Expected] | None = None,
 ) -> Options:
     """Reads the options of a command; ``--help`` and mistakes end the program.
 
@@ -47,8 +53,9 @@ def parse(
         words: after the command's name.
         command: for the usage line.
         positional: fields that stand without a name, in this order.
+        reads: as for :func:`parse_with`.
     """
-    return parse_with(options, (), words, command, positional)[0]
+    return parse_with(options, (), words, command, positional, reads=reads)[0]
 
 
 def parse_with(
@@ -59,6 +66,7 @@ def parse_with(
     positional: tuple[str, ...] = (),
     given: Mapping[str, Any] | None = None,
     about: str = "",
+    reads: Mapping[str, Expected] | None = None,
 ) -> tuple[Options, dict[str, Any]]:
     """As :func:`parse`, with the values of further options by name.
 
@@ -73,6 +81,10 @@ def parse_with(
         positional: fields that stand without a name, in this order.
         given: values of fields.
         about: says what the command does, if the options' documentation does not.
+        reads: what must be of which kind, by the name of the field or extra that names its path.
+
+    Raises:
+        WrongInput: a path is of another kind.
 
     Tyro reads a subclass of the dataclass that carries the command line's own conventions, so
     that the code it serves need not know them.
@@ -107,10 +119,21 @@ def parse_with(
     )
     found = {field.name: getattr(parsed, field.name) for field in own}
     found |= {name: value for name, value in values.items() if found[name] is None}
+    for name, expected in (reads or {}).items():
+        shown = name.upper() if name in positional else "--" + name.replace("_", "-")
+        for path in _paths(getattr(parsed, name)):
+            require(path, expected, f"{shown} of handavatar {command}")
     return (
         options(**found),
         {extra.name: getattr(parsed, extra.name) for extra in extras},
     )
+
+
+def _paths(value: Any) -> list[Path]:
+    """Those that an option names."""
+    if value is None:
+        return []
+    return [Path(each) for each in value] if isinstance(value, tuple) else [Path(value)]
 
 
 def _positional(kind: Any, name: str) -> Any:

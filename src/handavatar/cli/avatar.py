@@ -11,6 +11,7 @@ if TYPE_CHECKING:
 def train(words: list[str]) -> int:
     """Capture -> avatar; with --view, live in the browser."""
     from handavatar.cli.arguments import Extra, parse_with
+    from handavatar.cli.inputs import CAPTURE, PRIOR
     from handavatar.train.loop import TrainOptions, run_folder
     from handavatar.train.loop import train as train_avatar
 
@@ -20,7 +21,8 @@ def train(words: list[str]) -> int:
         Extra("host", str, "where the page listens, as for view", "127.0.0.1"),
         Extra("token", str, "who does not know it does not see the page, as for view", ""),
     )
-    options, extras = parse_with(TrainOptions, page, words, "train", ("capture",))
+    reads = {"capture": CAPTURE, "prior": PRIOR}
+    options, extras = parse_with(TrainOptions, page, words, "train", ("capture",), reads=reads)
     if extras["view"]:
         return _train_in_view(options, run_folder(options), extras)
     for extra in page:
@@ -48,10 +50,12 @@ def _say_trained(run: Path) -> None:
 def evaluate(words: list[str]) -> int:
     """PSNR, SSIM, LPIPS, mask IoU and what the truth allows, on held-out frames."""
     from handavatar.cli.arguments import JSON, parse_with, print_figures, print_json
+    from handavatar.cli.inputs import AVATAR, CAPTURE
     from handavatar.evaluate.run import EvaluateOptions, evaluate_run
     from handavatar.train.progress import Progress
 
-    options, extras = parse_with(EvaluateOptions, (JSON,), words, "evaluate", ("run",))
+    reads = {"run": AVATAR, "capture": CAPTURE}
+    options, extras = parse_with(EvaluateOptions, (JSON,), words, "evaluate", ("run",), reads=reads)
     with Progress("evaluate", 100) as progress:
         metrics = evaluate_run(
             options, lambda share, doing: progress.update(round(100 * share), doing)
@@ -64,19 +68,24 @@ def evaluate(words: list[str]) -> int:
 def edit(words: list[str]) -> int:
     """Save light, skin colour, paint and lifted shadows into an avatar."""
     from handavatar.cli.arguments import parse
+    from handavatar.cli.inputs import AVATAR, PAINT
     from handavatar.retouch import EditOptions, save_edited
 
-    print(save_edited(parse(EditOptions, words, "edit", positional=("run",))))
+    reads = {"run": AVATAR, "paint": PAINT}
+    print(save_edited(parse(EditOptions, words, "edit", ("run",), reads)))
     return 0
 
 
 def render(words: list[str]) -> int:
     """Pictures and video of any pose from any camera."""
     from handavatar.animate import RenderOptions, render_motion
+    from handavatar.capture.motion import MOTIONS
     from handavatar.cli.arguments import parse
+    from handavatar.cli.inputs import AVATAR, MOTION, PAINT, named
     from handavatar.processes import is_first_process
 
-    folder = render_motion(parse(RenderOptions, words, "render", positional=("run",)))
+    reads = {"run": AVATAR, "motion": named(MOTION, MOTIONS), "paint": PAINT}
+    folder = render_motion(parse(RenderOptions, words, "render", ("run",), reads))
     if is_first_process():
         print(folder)
     return 0
@@ -86,11 +95,14 @@ def export(words: list[str]) -> int:
     """Avatar -> a rigged GLB, a page for any browser, or a posed surface as PLY or OBJ."""
     import sys
 
+    from handavatar.capture.motion import MOTIONS
     from handavatar.cli.arguments import parse
+    from handavatar.cli.inputs import AVATAR, MOTION, PAINT, named
     from handavatar.export.run import ExportOptions, export_avatar
     from handavatar.train.progress import StagedProgress
 
-    options = parse(ExportOptions, words, "export", positional=("run", "format"))
+    reads = {"run": AVATAR, "motion": named(MOTION, MOTIONS), "paint": PAINT}
+    options = parse(ExportOptions, words, "export", ("run", "format"), reads)
     with StagedProgress() as progress:
         out = export_avatar(options, progress)
     if options.format == "web":
@@ -102,8 +114,9 @@ def export(words: list[str]) -> int:
 def view(words: list[str]) -> int:
     """Live in the browser: pose, camera, layers, light, skin, paint, shadow per finger."""
     from handavatar.cli.arguments import parse
+    from handavatar.cli.inputs import MOTION, SHOWN
     from handavatar.view.server import ViewOptions
     from handavatar.view.server import view as serve
 
-    serve(parse(ViewOptions, words, "view", positional=("run",)))
+    serve(parse(ViewOptions, words, "view", ("run",), {"run": SHOWN, "motion": MOTION}))
     return 0

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,6 +84,7 @@ _TABLES: dict[str, Callable[[], _Bench]] = {
 def bench(words: list[str]) -> int:
     """Measure a table: ``bench --table ablation|geometry|...``, or one of the other names."""
     from handavatar.cli.arguments import JSON, Extra, parse_with, print_json
+    from handavatar.cli.inputs import AVATAR, CAPTURE
     from handavatar.jobs.files import write_atomically
     from handavatar.train.progress import Progress
 
@@ -102,7 +103,10 @@ def bench(words: list[str]) -> int:
         Extra("out", Path | None, "Markdown file to write as well", None),
         JSON,
     )
-    options, extras = parse_with(chosen.options, extras_wanted, words, "bench")
+    inputs = {"capture": CAPTURE, "captures": CAPTURE, "avatar": AVATAR, "avatars": AVATAR}
+    own = {field.name for field in fields(chosen.options)}
+    reads = {field: expected for field, expected in inputs.items() if field in own}
+    options, extras = parse_with(chosen.options, extras_wanted, words, "bench", reads=reads)
     with Progress(f"bench {name}", options.total_steps) as progress:
         table = chosen.make(options, progress.update)
     if extras["out"] is not None:

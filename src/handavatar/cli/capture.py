@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from handavatar.cli.failures import BAD_DATA
+from handavatar.cli.failures import BAD_DATA, printable
 
 if TYPE_CHECKING:
     from handavatar.capture.video import VideoOptions
@@ -15,8 +15,10 @@ def video(words: list[str]) -> int:
     """A video of one bare hand (or several) -> capture: track, mask, fit pose and shape."""
     from handavatar.capture.video import VideoOptions
     from handavatar.cli.arguments import parse
+    from handavatar.cli.inputs import CAMERAS, MASKS, VIDEO
 
-    options = parse(VideoOptions, words, "capture video", positional=("file", "more"))
+    reads = {"file": VIDEO, "more": VIDEO, "masks": MASKS, "camera": CAMERAS}
+    options = parse(VideoOptions, words, "capture video", ("file", "more"), reads)
     for asked in options.of_each_hand():
         _capture_hand(asked)
     return 0
@@ -34,6 +36,7 @@ def webcam(words: list[str]) -> int:
     """A hand before the webcam -> capture; a page says what to show; --drive: an avatar follows."""
     from handavatar.capture.video import VideoOptions
     from handavatar.cli.arguments import Extra, parse_with
+    from handavatar.cli.inputs import AVATAR, CAMERAS, MASKS, VIDEO
 
     extras = (
         Extra(
@@ -60,6 +63,7 @@ def webcam(words: list[str]) -> int:
         "capture webcam",
         given={"file": Path(), "out": Path()},
         about=_WEBCAM,
+        reads={"drive": AVATAR, "more": VIDEO, "masks": MASKS, "camera": CAMERAS},
     )
     recording = _record(options, values)
     if recording is None:
@@ -132,9 +136,15 @@ def degrade(words: list[str]) -> int:
     """A worse copy of a capture: tracking noise, mask erosion, blur, JPEG."""
     from handavatar.capture.degraded import DegradeOptions, degrade_capture
     from handavatar.cli.arguments import OUT, OVERWRITE, parse_with
+    from handavatar.cli.inputs import CAPTURE
 
     options, extras = parse_with(
-        DegradeOptions, (OUT, OVERWRITE), words, "capture degrade", ("source",)
+        DegradeOptions,
+        (OUT, OVERWRITE),
+        words,
+        "capture degrade",
+        ("source",),
+        reads={"source": CAPTURE},
     )
     degrade_capture(extras["out"], options, extras["overwrite"])
     print(f"capture: {extras['out']}\nnext: handavatar train {extras['out']}")
@@ -168,15 +178,22 @@ class _CheckOptions:
 
 def check(words: list[str]) -> int:
     """Validate a capture: every problem with file, frame and remedy."""
-    from handavatar.capture.frames import find_problems
+    from handavatar.capture.soundness import find_problems
     from handavatar.cli.arguments import JSON, parse_with, print_json
+    from handavatar.cli.inputs import CHECKED
+    from handavatar.train.progress import Progress
 
-    options, extras = parse_with(_CheckOptions, (JSON,), words, "capture check", ("capture",))
-    problems = find_problems(options.capture)
+    options, extras = parse_with(
+        _CheckOptions, (JSON,), words, "capture check", ("capture",), reads={"capture": CHECKED}
+    )
+    with Progress("capture check", 100) as progress:
+        problems = find_problems(
+            options.capture, lambda done, total: progress.update(100 * done // total)
+        )
     if extras["json"]:
         print_json({"sound": not problems, "problems": [vars(problem) for problem in problems]})
     else:
         for problem in problems:
-            print(problem)
+            print(printable(str(problem)))
         print(f"{options.capture}: {f'{len(problems)} problems' if problems else 'sound'}")
     return BAD_DATA if problems else 0

@@ -6,11 +6,12 @@ def train(words: list[str]) -> int:
     import shlex
 
     from handavatar.cli.arguments import parse
+    from handavatar.cli.inputs import PRIOR
     from handavatar.processes import is_first_process
     from handavatar.train.prior import PriorEvaluationOptions, PriorOptions, train_prior
     from handavatar.train.progress import Progress
 
-    options = parse(PriorOptions, words, "prior train")
+    options = parse(PriorOptions, words, "prior train", reads={"start_from": PRIOR})
     if not is_first_process():
         train_prior(options)
         return 0
@@ -38,6 +39,7 @@ def train(words: list[str]) -> int:
 def evaluate(words: list[str]) -> int:
     """How well a prior knows inside from outside, on unseen poses and shapes."""
     from handavatar.cli.arguments import JSON, Extra, parse_with, print_figures, print_json
+    from handavatar.cli.inputs import PRIOR
     from handavatar.hand.rigs import load_rig
     from handavatar.train.prior import PriorEvaluationOptions, evaluate_prior
     from handavatar.train.prior_measures import measure_prior_file
@@ -47,7 +49,9 @@ def evaluate(words: list[str]) -> int:
         Extra("resolution", int, "cells along the longest side of their box", 128),
         JSON,
     )
-    options, extras = parse_with(PriorEvaluationOptions, extras_wanted, words, "prior evaluate")
+    options, extras = parse_with(
+        PriorEvaluationOptions, extras_wanted, words, "prior evaluate", reads={"prior": PRIOR}
+    )
     figures: dict[str, object] = {**evaluate_prior(options)}
     if extras["meshes"] > 0:
         base = load_rig(options.rig, options.level)
@@ -61,8 +65,10 @@ def evaluate(words: list[str]) -> int:
 def picture(words: list[str]) -> int:
     """Show the surfaces of priors side by side: flat, fist, pinch, crossed fingers."""
     from handavatar.cli.arguments import parse
+    from handavatar.cli.inputs import PRIOR
     from handavatar.train.prior_pictures import PriorPictureOptions, picture_priors
 
-    for path in picture_priors(parse(PriorPictureOptions, words, "prior picture")):
+    options = parse(PriorPictureOptions, words, "prior picture", reads={"priors": PRIOR})
+    for path in picture_priors(options):
         print(path)
     return 0

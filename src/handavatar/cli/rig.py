@@ -51,11 +51,17 @@ class _ImportOptions:
 def import_mano(words: list[str]) -> int:
     """Convert a user's MANO file once, safely."""
     from handavatar.cli.arguments import JSON, OVERWRITE, parse_with, print_figures, print_json
+    from handavatar.cli.inputs import MANO_FILE
     from handavatar.hand.mano import LICENCE, read_mano
     from handavatar.hand.rigs import save_rig
 
     options, extras = parse_with(
-        _ImportOptions, (JSON, OVERWRITE), words, "rig import-mano", ("file",)
+        _ImportOptions,
+        (JSON, OVERWRITE),
+        words,
+        "rig import-mano",
+        ("file",),
+        reads={"file": MANO_FILE},
     )
     model = read_mano(options.file, options.left_shape)
     path = save_rig(model, options.out, extras["overwrite"])

@@ -6,10 +6,11 @@ def train(words: list[str]) -> int:
     from contextlib import ExitStack
 
     from handavatar.cli.arguments import parse
+    from handavatar.cli.inputs import TRACKER
     from handavatar.synthetic.lessons import TrackerTrainOptions, train_made_tracker
     from handavatar.train.progress import Progress
 
-    options = parse(TrackerTrainOptions, words, "tracker train")
+    options = parse(TrackerTrainOptions, words, "tracker train", reads={"start": TRACKER})
     bars: dict[str, Progress] = {}
     with ExitStack() as shown:
 
@@ -30,9 +31,12 @@ def evaluate(words: list[str]) -> int:
     from dataclasses import asdict
 
     from handavatar.cli.arguments import JSON, parse_with, print_figures, print_json
+    from handavatar.cli.inputs import TRACKER
     from handavatar.synthetic.lessons import TrackerEvaluateOptions, evaluate_made_tracker
 
-    options, extras = parse_with(TrackerEvaluateOptions, (JSON,), words, "tracker evaluate")
+    options, extras = parse_with(
+        TrackerEvaluateOptions, (JSON,), words, "tracker evaluate", reads={"tracker": TRACKER}
+    )
     figures: dict[str, object] = asdict(evaluate_made_tracker(options))
     (print_json if extras["json"] else print_figures)(figures)
     return 0

@@ -10,6 +10,8 @@ from handavatar.geometry.meshes import Subdivision, subdivide_midpoint
 from handavatar.hand.rig import Rig, RigError
 from handavatar.hand.sparse_skin import SparseSkin
 
+_MAX_FACES = 1_000_000
+"""Of a subdivided rig: 4 rounds of the open hand are 0.8 million, and each takes 1 kB and more."""
 _SHIPPED = ("skin_full_2.safetensors", "skin_778_2.safetensors")
 """Made with ``handavatar rig refine --level full`` and ``--level 778``."""
 
@@ -24,8 +26,18 @@ def subdivided(rig: Rig, rounds: int = 2) -> Rig:
         rig: any rig.
         rounds: each multiplies the faces by four; the paper uses two.
 
+    Raises:
+        RigError: there would be more than a million faces.
+
     Source: paper Sec. 3.1. Refined skinning weights are another step: :func:`refined`.
     """
+    faces = len(rig.faces)
+    # Beyond 16 rounds the very number is not worth working out.
+    if not 0 <= rounds <= 16 or faces * 4**rounds > _MAX_FACES:
+        raise RigError(
+            f"{rounds} rounds of subdivision make more than {_MAX_FACES:,} faces of {faces:,} of "
+            f"{rig.name}\nthe method takes 2"
+        )
     for _ in range(rounds):
         rig = _subdivided_once(rig)
     return rig

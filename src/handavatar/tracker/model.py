@@ -103,7 +103,12 @@ def read_tracker(path: Path) -> TrainedTracker:
         )
         network = HandNetwork(len(points))
         network.load_state_dict(tensors, strict=False)
-    except (OSError, SafetensorError, KeyError, json.JSONDecodeError, RuntimeError) as error:
+    except TrackerError:
+        raise
+    except (
+        *(OSError, SafetensorError, KeyError, ValueError, RuntimeError),
+        *(TypeError, OverflowError, RecursionError),
+    ) as error:
         raise TrackerError(f"{path}: cannot be read as a tracker ({error})") from error
     return TrainedTracker(network.eval(), points)
 

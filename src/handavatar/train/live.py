@@ -105,7 +105,10 @@ def read_live(run: Run) -> LiveState | None:
                 content[name] = float(content[name])
         figures = {name: float(value) for name, value in content["figures"].items()}
         return LiveState(**{**content, "figures": figures})
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+    except (
+        *(OSError, ValueError, TypeError, KeyError, AttributeError),
+        *(OverflowError, RecursionError),
+    ):
         return None
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar, RenderSettings, chosen_device
 from handavatar.capture.frames import FITTED_SIDE, Capture, CaptureError, Frame, read_capture
+from handavatar.capture.soundness import require_sound
 from handavatar.capture.view import view_of
 from handavatar.edit import Edit
 from handavatar.evaluate.metrics import mean_color
@@ -274,7 +275,8 @@ def train(options: TrainOptions) -> Path:
     """Trains an avatar and returns the run folder.
 
     Raises:
-        CaptureError: if the capture is damaged or has no training frames.
+        CaptureError: if the capture is damaged, has no training or test frames, or its hand,
+            masks and pictures do not agree (:mod:`handavatar.capture.soundness`).
         RigError: if the rig that the capture's poses belong to is not here.
         CheckpointError: if the run to resume is damaged.
         NotFinite: if a weight, an optimiser's state or a loss is no longer finite; it names what,
@@ -295,6 +297,7 @@ def train(options: TrainOptions) -> Path:
         raise CaptureError(
             f"{capture.folder}: no frame of split 'train'", "mark some frames as split: train"
         )
+    require_sound(capture)
     frames = training_frames(capture, method)
     perceptual = perceptual_loss(options.perceptual).to(device)
     training = begin_training(capture, frames, method, options)
