@@ -3,7 +3,10 @@
 import copy
 import json
 import math
+import re
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +30,14 @@ from handavatar.field.anchors import Neighbours
 from handavatar.field.shading import CueSet, OrientedCues, TracedCues
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.hand import parts
 from handavatar.hand.detail import subdivided
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import POINT_ROUNDS, divide_into_parts
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import Rig
+from handavatar.jobs.finite import NotFinite
 from handavatar.plain import plain_rays
 from handavatar.train.prior import load_prior
 
@@ -419,6 +424,13 @@ def test_garbage_and_missing_files_are_refused(tmp_path: Path) -> None:
         HandAvatar.load(tmp_path / "nothing")
 
 
+def _about(file: Path) -> dict[str, Any]:
+    """What an avatar file says of itself beside its tensors."""
+    with safe_open(file, framework="pt") as opened:
+        about: dict[str, Any] = json.loads(opened.metadata()["handavatar"])
+    return about
+
+
 def _rewritten(file: Path, tmp_path: Path, about: object, drop: str = "-") -> Path:
     tensors = {name: value for name, value in load_file(file).items() if not name.startswith(drop)}
     path = tmp_path / "other.safetensors"
@@ -435,6 +447,54 @@ def test_the_field_is_given_the_points_that_its_prior_knows(rig: Rig, rounds: in
     assert len(avatar.parts.vertex_labels) == avatar.rig.num_vertices
 
 
+def test_an_avatar_keeps_its_part_points_however_others_are_drawn(
+    small_avatar: HandAvatar,
+    rendering: Rendering,
+    file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Another torch may draw others; and a version that stored none drew them at every load."""
+    older = _rewritten(file, tmp_path, _about(file), "parts.")
+
+    def shown(avatar: HandAvatar) -> Rendering:
+        return avatar.render(bent_pose(2), camera_above(24), settings=FEW)
+
+    for avatar in (HandAvatar.load(older), small_avatar.reloaded(older)):
+        _assert_equal(shown(avatar), rendering)
+    monkeypatch.setattr(parts, "divide_into_parts", partial(divide_into_parts, seed=1))
+    redrawn = HandAvatar.load(older)
+    assert not torch.equal(shown(redrawn).alpha, rendering.alpha)
+    for avatar in (HandAvatar.load(file), redrawn.reloaded(file)):
+        assert torch.equal(avatar.parts.corner_indices, small_avatar.parts.corner_indices)
+        assert torch.equal(avatar.parts.vertex_labels, small_avatar.parts.vertex_labels)
+        _assert_equal(shown(avatar), rendering)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda stored: {"corners": stored["corners"] + 5000}, "expected vertices of a rig of 778"),
+        (lambda stored: {"corners": -stored["corners"]}, "expected vertices of a rig of 778"),
+        (lambda stored: {n: values[:-1] for n, values in stored.items()}, "for each of 16 parts"),
+        (lambda stored: {n: values[:0] for n, values in stored.items()}, "for each of 16 parts"),
+        (lambda stored: {"corners": stored["corners"][:-16]}, "not a complete avatar"),
+    ],
+)
+def test_part_points_that_are_not_on_the_rig_are_refused(
+    file: Path,
+    tmp_path: Path,
+    change: Callable[[dict[str, torch.Tensor]], dict[str, torch.Tensor]],
+    message: str,
+) -> None:
+    tensors = load_file(file)
+    stored = {name: tensors[f"parts.{name}"] for name in ("corners", "barycentric")}
+    tensors |= {f"parts.{name}": values.contiguous() for name, values in change(stored).items()}
+    save_file(tensors, tmp_path / "spoilt", {"handavatar": json.dumps(_about(file))})
+    with pytest.raises(CheckpointError, match=message):
+        HandAvatar.load(tmp_path / "spoilt")
+
+
 @pytest.mark.parametrize("about", [None, [], {"schema": SCHEMA - 1}, {"schema": SCHEMA + 1}])
 def test_another_schema_is_refused(file: Path, tmp_path: Path, about: object) -> None:
     with pytest.raises(CheckpointError, match=r"other\.safetensors: not an avatar of schema"):
@@ -449,11 +509,54 @@ def test_a_file_that_says_too_little_is_refused(file: Path, tmp_path: Path, abou
 
 @pytest.mark.parametrize("drop", ["rig.faces", "avatar.albedo", "avatar.occupancy.encoder"])
 def test_a_file_that_lacks_tensors_is_refused(file: Path, tmp_path: Path, drop: str) -> None:
-    with safe_open(file, framework="pt") as opened:
-        about = json.loads(opened.metadata()["handavatar"])
+    about = _about(file)
     assert HandAvatar.load(_rewritten(file, tmp_path, about)).rounds == 0
     with pytest.raises(CheckpointError, match="not a complete avatar"):
         HandAvatar.load(_rewritten(file, tmp_path, about, drop))
+
+
+def test_an_avatar_with_nan_is_not_saved_and_the_old_file_stays(
+    small_avatar: HandAvatar, file: Path
+) -> None:
+    before = file.read_bytes()
+    spoilt = copy.deepcopy(small_avatar)
+    with torch.no_grad():
+        spoilt.albedo.codes[7, 3] = math.nan
+    with pytest.raises(NotFinite, match=r"not saved: avatar\.albedo\.codes holds NaN at \[7, 3\]"):
+        spoilt.save(file)
+    dimmed = copy.copy(small_avatar)
+    dimmed.edit = Edit(light_gain=math.inf)
+    with pytest.raises(NotFinite, match=r"edit\.light_gain is inf"):
+        dimmed.save(file)
+    assert file.read_bytes() == before
+    assert [path.name for path in file.parent.iterdir()] == [file.name]
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize(
+    "name", ["avatar.albedo.codes", "avatar.occupancy.decoder.mlp.output.bias", "rig.skin_weights"]
+)
+def test_an_avatar_file_with_nan_is_refused_and_the_tensor_named(
+    small_avatar: HandAvatar, file: Path, tmp_path: Path, name: str, bad: float
+) -> None:
+    tensors = load_file(file)
+    tensors[name].view(-1)[0] = bad
+    spoilt = tmp_path / "spoilt.safetensors"
+    save_file(tensors, spoilt, {"handavatar": json.dumps(_about(file))})
+    for load in (HandAvatar.load, small_avatar.reloaded):
+        with pytest.raises(CheckpointError, match=rf"spoilt\.safetensors: {re.escape(name)} holds"):
+            load(spoilt)
+
+
+@pytest.mark.parametrize("key", ["light_gain", "margin", "sharpness"])
+def test_an_avatar_file_whose_numbers_are_nan_is_refused(
+    file: Path, tmp_path: Path, key: str
+) -> None:
+    about = _about(file)
+    holder = about["edit"] if key in about["edit"] else about
+    holder[key] = math.nan
+    with pytest.raises(CheckpointError, match=rf"{key} is NaN, expected finite numbers"):
+        HandAvatar.load(_rewritten(file, tmp_path, about))
 
 
 def test_a_failed_save_leaves_the_old_file(
@@ -596,8 +699,7 @@ def test_a_light_that_there_is_not_is_refused_by_its_number(
 
 
 def test_the_file_of_one_light_says_nothing_of_lights(file: Path) -> None:
-    with safe_open(file, "pt") as opened:
-        about = json.loads(opened.metadata()["handavatar"])
+    about = _about(file)
     assert about["edit"].keys() == {"light_gain", "albedo_shift", "lifted_bones"}
     assert not [name for name in about if "light" in name]
     assert HandAvatar.load(file).num_lights == 1

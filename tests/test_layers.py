@@ -16,7 +16,7 @@ MAY_IMPORT = {
         "geometry": "",
         # Files and folders of a long command; knows no hand.
         "jobs": "",
-        "hand": "geometry",
+        "hand": "geometry jobs",
         # A texture's chart is that of a rig.
         "render": "geometry hand",
         # A hand laid onto pictures.

@@ -41,6 +41,7 @@ from handavatar.hand.parts import finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import RIG_ARRAYS, PosedHand, Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
+from handavatar.jobs.finite import find_not_finite, require_finite
 from handavatar.jobs.threads import mapped
 from handavatar.render.chart import charted
 from handavatar.render.rasterize import covered_pixels
@@ -67,6 +68,13 @@ def _stored_rig(name: str, tensors: dict[str, Tensor]) -> Rig:
     if "rig.pose_directions" in tensors:
         arrays["pose_directions"] = tensors["rig.pose_directions"]
     return Rig(name=name, vertex_sets=sets, **arrays)
+
+
+def _stored_part_points(tensors: dict[str, Tensor]) -> SurfacePoints | None:
+    """None in files of versions that drew them anew at every load."""
+    if "parts.corners" not in tensors:
+        return None
+    return SurfacePoints(tensors["parts.corners"].long(), tensors["parts.barycentric"])
 
 
 def _stored_edit(about: dict[str, Any], tensors: dict[str, Tensor]) -> Edit:
@@ -284,6 +292,7 @@ class HandAvatar(nn.Module):
         cues: CueSet | None = None,
         info: dict[str, Any] | None = None,
         num_lights: int = 1,
+        part_points: SurfacePoints | None = None,
     ) -> None:
         """An untrained avatar.
 
@@ -296,13 +305,15 @@ class HandAvatar(nn.Module):
             cues: what the illumination depends on; by default the paper's.
             info: facts that travel with the avatar (side, subject, method, ...).
             num_lights: one for each clip of the capture; shape and albedo are the same in all.
+            part_points: that the occupancy's encoder sees of each part, instead of drawing new ones
+                (when loading).
         """
         super().__init__()
         self.base_rig = rig
         self.rounds = rounds
         self.info: dict[str, Any] = dict(info or {})
         self.edit = Edit()
-        self.rig, self.parts = finer_rig(rig, rounds)
+        self.rig, self.parts = finer_rig(rig, rounds, part_points)
         # Subdivision keeps the vertices it finds, and refinement gives them weights too.
         skin_weights = self.rig.skin_weights[: rig.num_vertices]
         self.coarse_rig = replace(rig, skin_weights=skin_weights)
@@ -883,6 +894,9 @@ class HandAvatar(nn.Module):
         """Writes one safetensors file, aside first, then renamed into place.
 
         Of a licensed rig it holds only name and fingerprint.
+
+        Raises:
+            NotFinite: if a tensor or a number is NaN or infinite; nothing is written then.
         """
         tensors = {f"avatar.{name}": value for name, value in self.state_dict().items()}
         if self.base_rig.is_licensed:
@@ -893,6 +907,8 @@ class HandAvatar(nn.Module):
             tensors |= {f"set.{name}": value for name, value in self.base_rig.vertex_sets.items()}
             if self.base_rig.pose_directions.numel():
                 tensors["rig.pose_directions"] = self.base_rig.pose_directions
+        points = self.parts.points
+        tensors |= {"parts.corners": points.faces.int(), "parts.barycentric": points.barycentric}
         if self.edit.paint is not None:
             tensors |= {f"paint.{name}": value for name, value in vars(self.edit.paint).items()}
         about: dict[str, Any] = {
@@ -914,6 +930,7 @@ class HandAvatar(nn.Module):
         }
         if self.edit.light is not None:
             about["edit"]["light"] = self.edit.light
+        require_finite({**tensors, **about}, f"{path}: not saved")
         path.parent.mkdir(parents=True, exist_ok=True)
         aside = path.with_name(path.name + ".tmp")
         stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
@@ -928,7 +945,8 @@ class HandAvatar(nn.Module):
             path: an avatar file, or the folder of a finished run.
 
         Raises:
-            CheckpointError: if the file is missing, damaged, or not an avatar of this schema.
+            CheckpointError: if the file is missing, damaged, not an avatar of this schema, or holds
+                NaN or infinity; it names the tensor.
             RigError: if it was made with a licensed rig that is not imported here.
         """
         about, tensors = _stored(Path(path))
@@ -952,6 +970,7 @@ class HandAvatar(nn.Module):
                 anchors=anchors,
                 cues=cues,
                 num_lights=max(columns, 1),
+                part_points=_stored_part_points(tensors),
             )
             avatar._restore(about, tensors)
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -972,6 +991,12 @@ class HandAvatar(nn.Module):
         try:
             if (about["rig_sha256"], about["rounds"]) != (self.base_rig.sha256, self.rounds):
                 raise ValueError("it is of another rig")
+            points = _stored_part_points(tensors)
+            if points is None:
+                parts = finer_rig(self.base_rig, self.rounds)[1]
+            else:
+                parts = self.parts.with_points(points)
+            avatar.parts = parts.to(self.device)
             avatar._restore(about, tensors)
         except (KeyError, RuntimeError, TypeError, ValueError) as error:
             raise CheckpointError(f"{path}: not a state of this avatar ({error})") from error
@@ -1027,6 +1052,12 @@ def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     if not isinstance(about, dict) or about.get("schema") != SCHEMA:
         raise CheckpointError(
             f"{path}: not an avatar of schema {SCHEMA}; train it again with this version"
+        )
+    if found := find_not_finite({**tensors, **about}):
+        raise CheckpointError(
+            f"{path}: {found}, expected finite numbers\n"
+            "copy the file again, or train again into its run, from the last checkpoint: "
+            f"handavatar train CAPTURE --out {path.parent} --resume auto"
         )
     return about, tensors
 

@@ -71,6 +71,17 @@ def test_noise_is_told_row_by_row(
     # What was kept is not measured again.
     monkeypatch.setattr(registration, "register_capture", lambda capture: 1 / 0)
     assert registration_table(options).record() == table.record()
+    # Of another commit, or of another capture of that name, it is refused.
+    kept = tmp_path / "noise5-tiny-0-tracked.json"
+    content = json.loads(kept.read_text())
+    kept.write_text(json.dumps(content | {"commits": {"figures": "0123abcd"}}))
+    with pytest.raises(CaptureError, match="measured by commit 0123abcd"):
+        registration_table(options)
+    shown = registration_table(replace(options, any_commit=True))
+    assert shown.record() == table.record() and "commit 0123abcd" in shown.notes[-1]
+    kept.write_text(json.dumps(content | {"capture_sha256": "0" * 64}))
+    with pytest.raises(CaptureError, match="are of another capture"):
+        registration_table(options)
 
 
 @pytest.mark.parametrize(

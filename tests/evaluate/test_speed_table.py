@@ -1,6 +1,9 @@
 """The table of rendering's speed: same pictures, honest counts, and what it refuses."""
 
 import json
+import multiprocessing
+import sys
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -12,6 +15,7 @@ from handavatar.evaluate.speed_table import (
     SpeedTableOptions,
     counted,
     hand_camera,
+    most_memory,
     speed_table,
 )
 from handavatar.geometry.cameras import project
@@ -48,6 +52,15 @@ def test_the_ways_are_timed_on_the_same_pictures(options: SpeedTableOptions) -> 
     assert "8192 places in the box around a hand" in shown
     memory = table.rows["exact, 8 pixels"]["MB at most"]
     assert isinstance(memory, int) and 100 < memory < 2000
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process's own peak")
+def test_the_memory_of_whoever_started_a_process_is_not_its_own() -> None:
+    torch.ones(150_000_000).sum()  # 600 MB, given back
+    cpu = torch.device("cpu")
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        child = pool.submit(most_memory, cpu).result()
+    assert 100 < child < most_memory(cpu) - 300
 
 
 def test_operations_and_bytes_are_counted() -> None:

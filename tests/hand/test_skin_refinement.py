@@ -33,6 +33,7 @@ from handavatar.hand.skin_refinement import (
     strongest_bones,
     surface_loss,
 )
+from handavatar.jobs.finite import NotFinite
 
 TINY = RefinementOptions(steps=6, refit_steps=4, poses=2, surface_points=300)
 
@@ -242,6 +243,13 @@ def test_a_continued_refinement_is_the_same(problem: SkinRefinement, tmp_path: P
     assert not torch.equal(refine_skin(other).fitted, whole.fitted)
     with pytest.raises(RigError, match="continue with the options"):
         RefinementState.load(file, other)
+    spoilt = problem.begin()
+    spoilt.mean_gradient[5, 2] = float("nan")
+    with pytest.raises(NotFinite, match=r"not saved: mean_gradient holds NaN at \[5, 2\]"):
+        spoilt.save(file, problem)
+    assert RefinementState.load(file, problem).step == TINY.steps + 2
+    with pytest.raises(NotFinite, match=r"step 1: weights holds NaN at \[5, 2\]"):
+        refine_skin(problem, spoilt)
     file.write_bytes(b"short")
     with pytest.raises(RigError, match="delete it"):
         RefinementState.load(file, problem)

@@ -1,5 +1,8 @@
 """Films that are written say which colours they have, and are the same each time."""
 
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import av
@@ -37,6 +40,21 @@ def test_a_film_is_bt709_and_says_so(tmp_path: Path) -> None:
 def test_the_same_pictures_give_the_same_film(tmp_path: Path) -> None:
     first = _write(tmp_path / "a.mp4").read_bytes()
     assert first == _write(tmp_path / "b.mp4").read_bytes()
+
+
+def test_another_process_on_one_core_writes_the_same_film_at_another_time(tmp_path: Path) -> None:
+    first = _write(tmp_path / "a.mp4").read_bytes()
+    program = (
+        "import os, sys\n"
+        "if hasattr(os, 'sched_setaffinity'):\n"
+        "    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})\n"
+        f"sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+        "from pathlib import Path; from test_video_writer import _write\n"
+        f"_write(Path({str(tmp_path / 'other.mp4')!r}))"
+    )
+    time.sleep(1.1)  # Films may say when they were made, to the second.
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+    assert (tmp_path / "other.mp4").read_bytes() == first
 
 
 def test_odd_sizes_lose_a_row_and_a_column(tmp_path: Path) -> None:

@@ -1,15 +1,19 @@
 """The tracker's training as a command: pictures on disk, going on, what is refused."""
 
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 
 from handavatar.capture.checks import CaptureError
+from handavatar.jobs.finite import NotFinite, find_not_finite
 from handavatar.synthetic import lessons
 from handavatar.synthetic.lessons import TrackerTrainOptions, train_made_tracker
 from handavatar.tracker.model import TrackerError, read_tracker
+from handavatar.tracker.training import CropBatch, TrackerTraining
 
 
 @pytest.fixture
@@ -60,6 +64,41 @@ def test_a_training_makes_its_pictures_once_and_goes_on(
     with pytest.raises(CaptureError, match="cannot be read"):
         train_made_tracker(options)
     assert torch.equal(read_tracker(options.out).network.at_point, second.network.at_point)
+
+
+def test_a_training_that_diverges_keeps_the_last_good_state_and_says_how_to_go_on(
+    options: TrackerTrainOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lessons, "ProcessPoolExecutor", lambda *_: _Here())
+    monkeypatch.setattr(lessons, "_SAVED_EVERY", 0)
+    teach = TrackerTraining.teach
+
+    def spoiling(at: int) -> None:
+        def spoilt(training: TrackerTraining, batch: CropBatch) -> float:
+            loss = teach(training, batch)
+            if training.step == at:
+                with torch.no_grad():
+                    training.network.verdict.bias[0] = float("nan")
+            return loss
+
+        monkeypatch.setattr(TrackerTraining, "teach", spoilt)
+
+    spoiling(1)
+    with pytest.raises(NotFinite, match=r"step 1: network\.verdict\.bias holds NaN") as caught:
+        train_made_tracker(options)
+    assert str(caught.value).endswith("give the same command again with --rate 0.001")
+    spoiling(4)  # The last one.
+    with pytest.raises(NotFinite, match=r"t\.state holds step 3, which is good") as caught:
+        train_made_tracker(options)
+    assert str(caught.value).endswith("--resume --rate 0.001")
+    assert not options.out.exists()
+    monkeypatch.setattr(TrackerTraining, "teach", teach)
+    train_made_tracker(replace(options, resume=True, rate=0.001))
+    assert find_not_finite(read_tracker(options.out).network.state_dict()) is None
+    state_file = options.out.with_suffix(".state")
+    save_file(load_file(state_file) | {"network.verdict.bias": torch.full((2,), -inf)}, state_file)
+    with pytest.raises(CaptureError, match=r"verdict\.bias holds -inf(.|\n)*without --resume"):
+        train_made_tracker(replace(options, resume=True, steps=5))
 
 
 class _Here:

@@ -14,7 +14,9 @@ from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import Rig
+from handavatar.jobs.finite import NotFinite
 from handavatar.synthetic.lessons import TrackerEvaluateOptions, evaluate_made_tracker
+from handavatar.tracker import model
 from handavatar.tracker.measures import measure_tracker
 from handavatar.tracker.model import (
     TrackerError,
@@ -156,6 +158,29 @@ def test_a_tracker_comes_back_from_its_file(rig: Rig, tmp_path: Path) -> None:
         read_tracker(path)
     save_file({"x": torch.zeros(1)}, path)
     with pytest.raises(TrackerError, match="schema 1"):
+        read_tracker(path)
+
+
+def test_a_tracker_with_nan_is_neither_written_nor_read(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch.manual_seed(1)
+    points = tracked(rig)
+    tracker = TrainedTracker(HandNetwork(len(points)).eval(), points)
+    path = tmp_path / "t.safetensors"
+    save_tracker(path, tracker, {})
+    before = path.read_bytes()
+    bias = tracker.network.verdict.bias
+    for bad in (float("nan"), 1e5):  # The second is infinite in half precision alone.
+        with torch.no_grad():
+            bias[1] = bad
+        with pytest.raises(NotFinite, match=r"not saved, in half precision: verdict\.bias holds"):
+            save_tracker(path, tracker, {})
+    assert path.read_bytes() == before
+    with monkeypatch.context() as older:
+        older.setattr(model, "require_finite", lambda *_: None)
+        save_tracker(path, tracker, {})
+    with pytest.raises(TrackerError, match=r"t\.safetensors: verdict\.bias holds inf at \[1\]"):
         read_tracker(path)
 
 

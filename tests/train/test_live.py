@@ -233,7 +233,10 @@ def test_copies_of_the_avatar_take_a_small_share_of_the_time(
     assert json.loads((live_folder(run) / "progress.json").read_text())["step"] > 3900
 
 
-def test_a_run_is_named_before_it_begins(tiny_capture: Path, tmp_path: Path) -> None:
+def test_a_run_is_named_before_it_begins(
+    tiny_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # Runs that lie in "outputs" would be gone on with.
     options = TrainOptions(tiny_capture, tmp_path / "mine")
     assert run_folder(options) == tmp_path / "mine"
     assert run_folder(replace(options, out=None, resume="never")).parts[:2] == ("outputs", "tiny")

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,8 @@ from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar
 from handavatar.capture.frames import CaptureError, read_capture
 from handavatar.evaluate.perceptual import perceptual_loss
 from handavatar.geometry.rotations import matrix_from_axis_angle
+from handavatar.hand import parts
+from handavatar.hand.parts import divide_into_parts
 from handavatar.hand.rig import RigError
 from handavatar.train import loop
 from handavatar.train.loop import (
@@ -339,6 +342,18 @@ def test_an_interrupt_saves_and_the_rest_continues(
     _assert_same_end(tmp_path / "run", whole_run)
 
 
+def test_a_resumed_training_keeps_the_part_points_that_it_began_with(
+    tiny_capture: Path, whole_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole_run, run)
+    (run / "avatar.safetensors").unlink()
+    shutil.rmtree(run / "checkpoints" / "step-000000006")
+    monkeypatch.setattr(parts, "divide_into_parts", partial(divide_into_parts, seed=1))
+    train(_options(tiny_capture, run))
+    _assert_same_end(run, whole_run)
+
+
 def test_a_checkpoint_cut_in_half_falls_back_to_the_one_before(
     tiny_capture: Path, whole_run: Path, tmp_path: Path
 ) -> None:
@@ -362,6 +377,20 @@ def test_a_finished_run_is_not_trained_again(
     _assert_same_end(run, whole_run)
     with pytest.raises(CheckpointError, match="not empty"):
         train(replace(_options(tiny_capture, run), resume="never"))
+
+
+def test_an_interrupted_run_is_gone_on_with_beside_a_finished_one_of_a_later_date(
+    tiny_capture: Path, whole_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    runs = Path("outputs") / "tiny" / "quick"
+    shutil.copytree(whole_run, runs / "2099-01-01_000000")
+    shutil.copytree(whole_run, runs / "2020-01-01_000000")
+    (runs / "2020-01-01_000000" / "avatar.safetensors").unlink()
+    options = replace(_options(tiny_capture, Path("-")), out=None)
+    assert train(options) == runs / "2020-01-01_000000"
+    again = train(replace(options, steps=1))
+    assert again.parent == runs and again not in (runs / "2020-01-01_000000", runs / "2099-01-01")
 
 
 def test_a_loss_that_is_not_finite_ends_the_run_and_keeps_the_checkpoint(

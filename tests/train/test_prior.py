@@ -26,6 +26,8 @@ from handavatar.hand.parts import POINT_ROUNDS, divide_into_parts, finer_rig
 from handavatar.hand.pose import CONNECTED_PAIRS, NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
+from handavatar.jobs.finite import NotFinite, find_not_finite
+from handavatar.train import prior
 from handavatar.train.labelled_poses import PoseStream, labelled_pose
 from handavatar.train.pretraining import OccupancyLoss
 from handavatar.train.prior import (
@@ -35,6 +37,7 @@ from handavatar.train.prior import (
     evaluate_prior,
     load_prior,
     open_prior,
+    save_prior,
     train_prior,
 )
 from handavatar.train.stage_times import StageTimes
@@ -89,6 +92,72 @@ def test_labelled_points_lie_about_the_hand_and_their_labels_are_true() -> None:
     assert float(distances.max()) < 0.06
     # Half lie near the surface: 4 mm at most of noise, and vertices some 5 mm apart.
     assert float((distances[200:] < 0.02).float().mean()) > 0.95
+
+
+def test_a_prior_with_nan_is_neither_written_nor_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    field, rig = PairOccupancy(), load_open_hand("778")
+    save_prior(field, _options(tmp_path / "a"), rig, 1)
+    before = (tmp_path / "a").read_bytes()
+    with torch.no_grad():
+        field.encoder.input.weight[3, 2] = float("nan")
+    with pytest.raises(
+        NotFinite, match=r"a: not saved: encoder\.input\.weight holds NaN at \[3, 2\]"
+    ):
+        save_prior(field, _options(tmp_path / "a"), rig, 2)
+    assert (tmp_path / "a").read_bytes() == before
+    with monkeypatch.context() as older:
+        older.setattr(prior, "require_finite", lambda *_: None)
+        save_prior(field, _options(tmp_path / "a"), rig, 2)
+    with pytest.raises(CheckpointError, match=r"encoder\.input\.weight holds NaN at \[3, 2\]"):
+        load_prior(PairOccupancy(), tmp_path / "a")
+
+
+def test_a_prior_that_diverges_says_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With a folder from its last checkpoint, without one from the file, or from the beginning."""
+    options = replace(_options(tmp_path / "a"), steps=4, checkpoint_every=2)
+    with_folder = replace(options, folder=tmp_path / "run")
+    advance = torch.optim.Adam.step
+
+    def diverging(at: int, state: bool) -> None:
+        steps = [0]
+
+        def step(self: torch.optim.Adam, closure: None = None) -> None:
+            advance(self)
+            steps[0] += 1
+            if steps[0] == at:
+                parameter = self.param_groups[0]["params"][0]
+                spoilt = self.state[parameter]["exp_avg_sq"] if state else parameter.data
+                spoilt.view(-1)[0] = float("inf")
+
+        monkeypatch.setattr(torch.optim.Adam, "step", step)
+
+    diverging(1, False)
+    with pytest.raises(NotFinite, match=r"step 1: .* holds inf(.|\n)*again with --seed 1$"):
+        train_prior(options)
+    assert not (tmp_path / "a").exists()
+    # In the last step, and in the optimiser alone.
+    diverging(4, True)
+    with pytest.raises(NotFinite, match=r"step 4: adam\.\d+\.exp_avg_sq holds inf") as caught:
+        train_prior(options)
+    assert f"--start-from {tmp_path / 'a'} --seed 1" in str(caught.value)
+    diverging(3, False)
+    with pytest.raises(NotFinite, match=r"step 3(.|\n)*checkpoint of step 2 is good") as caught:
+        train_prior(with_folder)
+    assert f"--folder {tmp_path / 'run'} --seed 1" in str(caught.value)
+    monkeypatch.setattr(torch.optim.Adam, "step", advance)
+    for again in (
+        replace(options, start_from=tmp_path / "a", seed=1),
+        replace(with_folder, seed=1),
+        replace(with_folder, seed=1),  # It is the run's own seed by now.
+    ):
+        assert find_not_finite(train_prior(again).state_dict()) is None
+        load_prior(PairOccupancy(), tmp_path / "a")
+    with pytest.raises(CheckpointError, match="other options: seed"):
+        train_prior(replace(with_folder, seed=2))
 
 
 def test_broken_priors_are_refused(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import torch
 
 from handavatar.avatar import CheckpointError
 from handavatar.jobs.files import MARKER
+from handavatar.jobs.finite import NotFinite
 from handavatar.train import runs
 from handavatar.train.optimizer_state import (
     optimizer_options,
@@ -27,8 +28,8 @@ from handavatar.train.runs import (
     append_log,
     create_run,
     default_run_folder,
+    interrupted_run_folder,
     latest_checkpoint,
-    latest_run_folder,
     load_checkpoint,
     locked,
     open_run,
@@ -168,15 +169,51 @@ def test_no_run_folder_is_a_clear_error(tmp_path: Path) -> None:
         _ = open_run(run.folder).facts
 
 
-def test_resume_auto_finds_the_newest_run(tmp_path: Path) -> None:
-    capture = tmp_path / "hand"
-    assert latest_run_folder(capture, "quick", tmp_path) is None
-    for name in ("2030-01-01_000000", "2030-01-02_000000"):
-        _new_run(tmp_path / "hand" / "quick" / name)
-    (tmp_path / "hand" / "quick" / "2031-01-01_000000").mkdir()  # never begun
-    found = latest_run_folder(capture, "quick", tmp_path)
-    assert found is not None and found.name == "2030-01-02_000000"
-    assert default_run_folder(capture, "quick", tmp_path).parent == found.parent
+def _begun(folder: Path, started: str, sha256: str = "a", method: str = "quick") -> Path:
+    """A run that says that it was begun then."""
+    create_run(
+        folder,
+        {"method": method},
+        seed=1,
+        capture=folder,
+        capture_sha256=sha256,
+        perceptual="gradient-pyramid",
+    )
+    facts = json.loads((folder / "run.json").read_text())
+    (folder / "run.json").write_text(json.dumps(facts | {"started": started}))
+    return folder
+
+
+def test_resume_auto_goes_by_what_runs_say_of_themselves(tmp_path: Path) -> None:
+    assert interrupted_run_folder("a", "quick", tmp_path) is None
+    runs_of = tmp_path / "hand" / "quick"
+    finished = _begun(runs_of / "2099-01-01_000000", "2026-11-30T12:00:00+00:00")
+    (finished / "avatar.safetensors").write_bytes(b"whole")
+    assert interrupted_run_folder("a", "quick", tmp_path) is None
+    # Named, and written, in another order than they were begun in; one in another zone.
+    earlier = _begun(runs_of / "zzz", "2026-11-30T10:30:00+01:00")
+    last = _begun(runs_of / "aaa", "2026-11-30T10:00:00+00:00")
+    os.utime(last / "run.json", (0, 0))
+    os.utime(earlier / "run.json")
+    _begun(runs_of / "other-capture", "2026-11-30T11:00:00+00:00", sha256="b")
+    _begun(runs_of / "other-method", "2026-11-30T11:00:00+00:00", method="best")
+    (runs_of / "never-begun").mkdir()
+    assert interrupted_run_folder("a", "quick", tmp_path) == last
+    (last / "avatar.safetensors").write_bytes(b"whole")
+    assert interrupted_run_folder("a", "quick", tmp_path) == earlier
+    default = default_run_folder(tmp_path / "hand", "quick", tmp_path)
+    assert default.parent == runs_of
+
+
+@pytest.mark.parametrize("text", ['{"capture": ', "[]", "{}", '{"capture": 3, "started": "now"}'])
+def test_resume_auto_passes_over_what_cannot_be_read_and_says_so(
+    tmp_path: Path, text: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    broken = _begun(tmp_path / "hand" / "quick" / "2099", "2026-11-30T12:00:00+00:00")
+    (broken / "run.json").write_text(text)
+    whole = _begun(tmp_path / "hand" / "quick" / "2000", "2026-11-30T10:00:00+00:00")
+    assert interrupted_run_folder("a", "quick", tmp_path) == whole
+    assert "2099: is passed over" in caplog.text
 
 
 def test_checkpoints_return_bit_for_bit_and_old_ones_are_pruned(tmp_path: Path) -> None:
@@ -374,9 +411,48 @@ def test_nan_never_reaches_a_file(tmp_path: Path) -> None:
     run = _new_run(tmp_path / "run")
     with pytest.raises(ValueError):
         append_log(run, 1, {"loss": float("nan")})
-    with pytest.raises(ValueError):
+    with pytest.raises(NotFinite, match=r"checkpoint of step 1: state\.loss is inf"):
         save_checkpoint(run, 1, {}, {"loss": float("inf")})
     assert not run.log.exists() and latest_checkpoint(run) is None
+
+
+@pytest.mark.parametrize("stem", ["model", "optimizer"])
+def test_a_checkpoint_with_nan_is_not_written_and_the_one_before_stays(
+    tmp_path: Path, stem: str
+) -> None:
+    run = _new_run(tmp_path / "run")
+    _save(run, 3)
+    tensors = _tensors(4)
+    name = {"model": "layer.weight", "optimizer": "0.exp_avg"}[stem]
+    tensors[stem][name][2, 1] = float("nan")
+    with pytest.raises(NotFinite, match=rf"of step 4: {stem}\.{name} holds NaN at \[2, 1\]"):
+        save_checkpoint(run, 4, tensors, {"step": 4, "rate": 0.1})
+    _assert_holds(run, 3)
+    assert [path.name for path in run.checkpoints.iterdir()] == ["step-000000003"]
+
+
+@pytest.mark.parametrize("file", ["model", "state"])
+def test_a_checkpoint_that_an_older_version_wrote_with_nan_is_put_aside(
+    tmp_path: Path, file: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    run = _new_run(tmp_path / "run")
+    _save(run, 3)
+    tensors, state = _tensors(4), {"step": 4, "rate": 0.1}
+    with monkeypatch.context() as older:
+        older.setattr(runs, "require_finite", lambda *_: None)
+        dumps = json.dumps
+        older.setattr(runs.json, "dumps", lambda value, **_: dumps(value))
+        if file == "model":
+            tensors["model"]["layer.weight"][0, 0] = float("inf")
+        else:
+            state["rate"] = float("nan")
+        checkpoint = save_checkpoint(run, 4, tensors, state)
+    what = {"model": r"model\.layer\.weight holds inf at \[0, 0\]", "state": r"state\.rate is NaN"}
+    with pytest.raises(CheckpointError, match=f"cannot be gone on from: {what[file]}"):
+        load_checkpoint(checkpoint)
+    _assert_holds(run, 3)
+    assert (run.folder / "corrupt" / "step-000000004").is_dir()
+    assert "step-000000004" in caplog.text and "moved to corrupt/" in caplog.text
 
 
 def _trained(num_steps: int, model: torch.nn.Linear, optimizer: torch.optim.Optimizer) -> None:

@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -67,10 +68,13 @@ from handavatar.geometry.cameras import Camera
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
+from handavatar.jobs.files import write_atomically
 from handavatar.synthetic.films import FILMS, make_film
 from handavatar.synthetic.truth import FilmTruth, read_film_truth
+from handavatar.train.kept import capture_fingerprint, origin, origin_notes, read_kept
 from handavatar.train.loop import METHODS, TrainOptions, begin_training
 from handavatar.train.outlines import corrected_pose, fit_outlines
+from handavatar.train.provenance import folder_sha256
 
 ROWS = ("tracked", "fitted", "outlines", "registered")
 CORRELATION = 0.5
@@ -95,7 +99,10 @@ class RegistrationTableOptions:
     tracker: TrackerChoice = "auto"
     """who finds the hand of films, as in capture video"""
     keep: Path | None = None
-    """folder of results by clip, row and tracker: what lies there is not measured again"""
+    """folder of results by clip, row and tracker: what lies there is not measured again; results of
+    another capture or film are refused"""
+    any_commit: bool = False
+    """kept results that another commit measured are shown too, and the table says which"""
 
     def __post_init__(self) -> None:
         """Refuses cases and rows that there are not."""
@@ -150,8 +157,10 @@ def registration_table(
     """
     finished = step_counter(report)
     cases: dict[str, dict[str, Figures]] = {}
+    results = _Results(options.keep, options.any_commit)
     for case in options.cases:
-        clips = _film_scores(options) if case == "video" else _noise_scores(case, options)
+        is_film = case == "video"
+        clips = _film_scores(options, results) if is_film else _noise_scores(case, options, results)
         of_clips: dict[str, dict[str, ClipScores]] = {}
         for clip, row, scores in clips:
             of_clips.setdefault(clip, {})[row] = scores
@@ -168,7 +177,7 @@ def registration_table(
             for case, rows in cases.items()
             for row, figures in rows.items()
         },
-        notes=_NOTES,
+        notes=(*_NOTES, *origin_notes(results.kept)),
         cases=cases,
     )
 
@@ -211,34 +220,49 @@ def _cell(value: float | list[float] | None) -> Cell:
 # --------------------------------------------------------------------------------- results kept
 
 
-def _kept_or_measured(
-    options: RegistrationTableOptions, name: str, measure: Callable[[], ClipScores | None]
-) -> ClipScores | None:
-    """The result of that name in the folder of results, or one that is measured and left there."""
-    if options.keep is None:
-        return measure()
-    path = options.keep / f"{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}.json"
-    if path.is_file():
-        content = json.loads(path.read_text("utf-8"))
-        return ClipScores(content["figures"], tuple(content["of_frames"]))
-    scores = measure()
-    if scores is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        content = {"figures": dict(scores.figures), "of_frames": list(scores.of_frames)}
-        path.write_text(json.dumps(content, indent=1, allow_nan=False), "utf-8")
-    return scores
+class _Results:
+    """Results of clips: those that are kept in a folder, or that are measured and left there.
+
+    Attributes:
+        kept: what was found in the folder, by name.
+    """
+
+    def __init__(self, folder: Path | None, any_commit: bool) -> None:
+        self.kept: dict[str, dict[str, Any]] = {}
+        self._folder = folder
+        self._any_commit = any_commit
+
+    def of(
+        self, name: str, sha256: str, measure: Callable[[], ClipScores | None]
+    ) -> ClipScores | None:
+        """The result of a name, of a capture or film with that fingerprint."""
+        if self._folder is None:
+            return measure()
+        path = self._folder / f"{re.sub(r'[^A-Za-z0-9_.-]', '_', name)}.json"
+        content = read_kept(path, sha256, self._any_commit)
+        if content:
+            self.kept[name] = content
+            return ClipScores(content["figures"], tuple(content["of_frames"]))
+        scores = measure()
+        if scores is not None:
+            content = {"figures": dict(scores.figures), "of_frames": list(scores.of_frames)}
+            content |= origin(sha256, content)
+            text = json.dumps(content, indent=1, allow_nan=False)
+            write_atomically({path: text.encode()})
+        return scores
 
 
 # ------------------------------------------------------------------------------- poses with noise
 
 
 def _noise_scores(
-    case: str, options: RegistrationTableOptions
+    case: str, options: RegistrationTableOptions, results: _Results
 ) -> Iterator[tuple[str, str, ClipScores]]:
     named = _NOISE_CASE.fullmatch(case)
     assert named is not None
     sources = [read_capture(path) for path in options.captures] or [default_capture()]
     for source in sources:
+        sha256 = capture_fingerprint(source.folder)
         for seed in options.seeds:
             clip = f"{source.folder.resolve().name}-{seed}"
             with tempfile.TemporaryDirectory(prefix="handavatar-bench-") as folder:
@@ -250,9 +274,9 @@ def _noise_scores(
                 )
                 spoilt = degrade_capture(Path(folder) / "spoilt", how)
                 for row in options.rows:
-                    scores = _kept_or_measured(
-                        options,
+                    scores = results.of(
                         f"{case}-{clip}-{row}",
+                        sha256,
                         partial(_noisy_row, row, source, spoilt),
                     )
                     if scores is not None:
@@ -308,20 +332,23 @@ def _film_paths(folder: Path) -> list[Path]:
     return made or [folder / f"{film.name}.mp4" for film in FILMS]
 
 
-def _film_scores(options: RegistrationTableOptions) -> Iterator[tuple[str, str, ClipScores]]:
+def _film_scores(
+    options: RegistrationTableOptions, results: _Results
+) -> Iterator[tuple[str, str, ClipScores]]:
     paths = _film_paths(options.films)
     for path in paths:
         film = next((film for film in FILMS if film.name == path.stem), None)
         if not path.is_file() and film is not None:
             make_film(film, options.films)
     for path in paths:
+        sha256 = folder_sha256(path.parent, (path.name, path.with_suffix(".json").name))
         with tempfile.TemporaryDirectory(prefix="handavatar-bench-") as folder:
             road = FilmRoad(path, Path(folder), options.tracker)
             for row in options.rows:
-                scores = _kept_or_measured(
-                    options,
+                scores = results.of(
                     f"video-{path.stem}-{row}"
                     + ("" if options.tracker == "auto" else f"-{options.tracker}"),
+                    sha256,
                     partial(road.scores, row),
                 )
                 if scores is not None:

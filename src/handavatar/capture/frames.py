@@ -57,6 +57,7 @@ from handavatar.jobs.files import (
     restore_folder,
     swap_folder,
 )
+from handavatar.jobs.finite import find_not_finite
 
 Said = TypeVar("Said")
 """What a frame may say of itself."""
@@ -190,6 +191,24 @@ class Frame:
     def shown(self) -> UInt8[Tensor, "height width 3"]:
         """The picture for people to look at: grey where nothing is known."""
         return torch.where(self.known[..., None], self.image, self.image.new_tensor(_UNKNOWN_GREY))
+
+    def require_finite(self) -> None:
+        """Refuses a frame whose numbers are not finite.
+
+        Raises:
+            CaptureError: if one is NaN or infinite; it says of which frame, and which.
+        """
+        numbers = {
+            "pose": vars(self.pose),
+            "camera": vars(self.camera),
+            "gain": self.gain,
+            "confidence": self.confidence,
+            "time": self.time,
+            "covariance": self.covariance,
+            "landmarks": None if self.landmarks is None else vars(self.landmarks),
+        }
+        if found := find_not_finite(numbers):
+            raise CaptureError(f"frame {self.name} is not finite: its {found}", "drop the frame")
 
     def binned(self, side: int) -> "Frame":
         """The same frame with square blocks of pixels averaged, as large ones as leave it ``side``.
@@ -765,7 +784,7 @@ class CaptureWriter:
         """Writes one frame's picture and mask.
 
         Raises:
-            CaptureError: if its pose is not finite or its name is no plain file name.
+            CaptureError: if a number is not finite or its name is no plain file name.
         """
         if not re.fullmatch(r"[A-Za-z0-9_-]{1,100}", frame.name):
             raise CaptureError(f"{frame.name!r} is no name for a frame", "use letters and digits")
@@ -776,11 +795,7 @@ class CaptureWriter:
             "rotations": frame.pose.rotations.detach().cpu().double(),
             "translation": frame.pose.translation.detach().cpu().double(),
         }
-        for name, value in pose.items():
-            if not bool(torch.isfinite(value).all()):
-                raise CaptureError(
-                    f"frame {frame.name}: the {name} of its pose are not finite", "drop the frame"
-                )
+        frame.require_finite()
         Image.fromarray(frame.image.cpu().numpy()).save(self.file(image_path))
         Image.fromarray(frame.coverage.cpu().numpy()).save(self.file(mask_path))
         said: dict[str, Any] = {}

@@ -33,6 +33,7 @@ from handavatar.hand.pose_sampling import (
     rotations_from_angles,
 )
 from handavatar.hand.rig import Rig
+from handavatar.jobs.finite import find_not_finite
 
 SCHEMA = 1
 LONG_GAP = 0.75
@@ -215,19 +216,18 @@ def write_motion(path: Path, motion: Motion) -> None:
     """Writes a motion file; it appears whole or not at all.
 
     Raises:
-        CaptureError: if a pose is not finite.
+        CaptureError: if a number is not finite; it says which.
     """
     path = Path(path)
+    if found := find_not_finite(vars(motion)):
+        raise CaptureError(f"{path}: {found}", "write finite poses")
     content = {
         "schema": SCHEMA,
         "fps": motion.fps,
         "rotations": motion.rotations.double().tolist(),
         "translations": motion.translations.double().tolist(),
     }
-    try:
-        text = json.dumps(content, allow_nan=False)
-    except ValueError as error:
-        raise CaptureError(f"{path}: a pose is not finite", "write finite poses") from error
+    text = json.dumps(content, allow_nan=False)
     aside = path.with_name(f".{path.name}.part")
     try:
         aside.write_text(text, encoding="utf-8")

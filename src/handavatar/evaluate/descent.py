@@ -1,10 +1,11 @@
 """How what is only compared with is fitted."""
 
-import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
+
+from handavatar.jobs.finite import require_finite
 
 _DECAY = 0.05
 """The learning rate falls by this factor until the end, exponentially."""
@@ -20,17 +21,15 @@ def descend(module: nn.Module, loss_of_step: Callable[[], Tensor], steps: int, r
         rate: learning rate at the start.
 
     Raises:
-        FloatingPointError: if a loss is not finite.
+        NotFinite: if a loss, or a weight in the end, is NaN or infinite.
     """
     optimizer = torch.optim.Adam(module.parameters(), lr=rate)
     falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, _DECAY ** (1 / max(steps, 1)))
     for step in range(steps):
         loss = loss_of_step()
-        if not math.isfinite(float(loss.detach())):
-            raise FloatingPointError(
-                f"{type(module).__name__}: the loss of step {step + 1} is not finite"
-            )
+        require_finite({"loss": loss}, f"{type(module).__name__}, step {step + 1}")
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         falling.step()
+    require_finite(module.state_dict(), f"{type(module).__name__}, step {steps}")

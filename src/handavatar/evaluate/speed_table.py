@@ -377,15 +377,15 @@ def _rendered_alone(
     avatar = HandAvatar.load(path).moved_to(device)
     with torch.no_grad():
         scene = _scene(avatar, next(iter(GESTURES)), 0, size, 1)
-    before = _most_memory(device)
+    before = most_memory(device)
     if device.type == "cuda":
         avatar.render(scene.pose, scene.camera, settings=settings)
     begin = _now(device)
     avatar.render(scene.pose, scene.camera, settings=settings)
-    return _now(device) - begin, before, _most_memory(device)
+    return _now(device) - begin, before, most_memory(device)
 
 
-def _most_memory(device: torch.device) -> float:
+def most_memory(device: torch.device) -> float:
     """The most that this process has held so far on its device, megabytes."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 1e6

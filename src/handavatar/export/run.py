@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from handavatar import __version__
-from handavatar.avatar import CheckpointError, HandAvatar
+from handavatar.avatar import HandAvatar
 from handavatar.capture.motion import Motion, gesture, open_motion
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
@@ -85,9 +85,6 @@ def export_avatar(options: ExportOptions, tell: Tell = lambda job, step, total: 
     options.check_look()
     _check(options)
     avatar = HandAvatar.load(options.run)
-    weights = [value for value in avatar.state_dict().values() if value.is_floating_point()]
-    if not all(bool(torch.isfinite(value).all()) for value in weights):
-        raise CheckpointError(f"{options.run}: holds NaN or infinity; train the avatar again")
     edit = options.edit_on(avatar)
     if options.format == "web":
         _write_web(avatar, edit, options, tell)

@@ -72,6 +72,38 @@ class Parts:
             self.barycentric.to(device),
         )
 
+    @property
+    def points(self) -> SurfacePoints:
+        """The points of all parts, one part after the other, as they are stored."""
+        return SurfacePoints(self.corner_indices.flatten(0, 1), self.barycentric.flatten(0, 1))
+
+    def with_points(self, points: SurfacePoints) -> "Parts":
+        """The same parts with other points, such as stored ones.
+
+        Args:
+            points: as :attr:`points` gives them.
+
+        Raises:
+            RigError: if they are not as many for each part, or not on this rig.
+        """
+        count, corners = len(points.faces), points.faces
+        if count == 0 or count % NUM_BONES or len(points.barycentric) != count:
+            raise RigError(
+                f"part points: found {count} with {len(points.barycentric)} weights, expected as "
+                f"many for each of {NUM_BONES} parts"
+            )
+        if int(corners.min()) < 0 or int(corners.max()) >= len(self.vertex_labels):
+            raise RigError(
+                f"part points: found corners from {int(corners.min())} to {int(corners.max())}, "
+                f"expected vertices of a rig of {len(self.vertex_labels)}"
+            )
+        shape = (NUM_BONES, count // NUM_BONES)
+        return Parts(
+            self.vertex_labels,
+            corners.long().unflatten(0, shape),
+            points.barycentric.unflatten(0, shape),
+        )
+
     def point_clouds(self, posed: PosedHand) -> Float[Tensor, "bones points 6"]:
         """Points and unit normals of each part in its own bone's frame (metres).
 
@@ -167,18 +199,28 @@ def divide_into_parts(
     return Parts(vertex_labels, torch.stack(corner_indices), torch.stack(barycentric))
 
 
-def finer_rig(base: Rig, rounds: int) -> tuple[Rig, Parts]:
+def finer_rig(base: Rig, rounds: int, points: SurfacePoints | None = None) -> tuple[Rig, Parts]:
     """A rig subdivided so many times, and its parts, with points as a prior knows them.
 
     The finer rig is :func:`handavatar.hand.detail.refined`; which bone owns a vertex is told by the
     averaged weights, so that the parts do not depend on the refinement.
 
+    Args:
+        base: the rig.
+        rounds: midpoint subdivisions.
+        points: of the parts, as :attr:`Parts.points` has given them; drawn if there are none.
+
     Raises:
-        RigError: as :func:`divide_into_parts`.
+        RigError: as :func:`divide_into_parts` and :meth:`Parts.with_points`.
     """
     known = subdivided(base, min(rounds, POINT_ROUNDS))
     averaged = subdivided(known, max(rounds - POINT_ROUNDS, 0))
-    return refined(base, rounds, fine=averaged), divide_into_parts(averaged, drawn_on=known)
+    fine = refined(base, rounds, fine=averaged)
+    if points is None:
+        return fine, divide_into_parts(averaged, drawn_on=known)
+    labels = averaged.skin_weights.cpu().argmax(-1)
+    nothing = torch.zeros(NUM_BONES, 0, 3)
+    return fine, Parts(labels, nothing.long(), nothing).with_points(points)
 
 
 def _require_coarser(coarse: Rig, fine: Rig) -> None:

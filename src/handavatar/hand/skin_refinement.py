@@ -28,9 +28,11 @@ from handavatar.hand.pose import FINGER_BONES, bone_transforms
 from handavatar.hand.pose_sampling import sample_poses
 from handavatar.hand.rig import Rig, RigError
 from handavatar.hand.sparse_skin import MAX_BONES
+from handavatar.jobs.finite import require_finite
 
 SHARPNESS = 100.0
 """The paper's eta: a weight of 0.01 counts as 63 % of a bone."""
+_BEGIN_ANEW = "begin anew with another --seed or a lower --lr, and without --resume"
 # Decay of the running means of the gradient and of its square.
 _MOMENTUM, _SCALE = 0.9, 0.99
 
@@ -97,7 +99,12 @@ class RefinementState:
     free: Float[Tensor, "vertices bones"]
 
     def save(self, path: Path, problem: "SkinRefinement") -> None:
-        """Writes the state aside and renames it into place."""
+        """Writes the state aside and renames it into place.
+
+        Raises:
+            NotFinite: if a value is NaN or infinite; the state before stays.
+        """
+        require_finite(vars(self), f"{path}: not saved", _BEGIN_ANEW)
         # A tensor that is two of the fields at once is stored twice.
         tensors = {name: value.clone() for name, value in vars(self).items() if name != "step"}
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -116,6 +123,7 @@ class RefinementState:
             with safe_open(path, framework="pt") as file:
                 header = file.metadata() or {}
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            require_finite(tensors, "state")
             state = RefinementState(step=int(header["step"]), **tensors)
         except Exception as error:
             raise RigError(
@@ -411,7 +419,10 @@ class SkinRefinement:
         rate = options.lr * (options.final_lr / options.lr) ** share
         direction = mean_gradient / (1 - _MOMENTUM**done)
         scale = (mean_square / (1 - _SCALE**done)).sqrt() + 1e-12
-        moved = on_simplex(state.weights - rate * direction / scale, state.support)
+        moved = state.weights - rate * direction / scale
+        values = {"weights": moved, "mean_gradient": mean_gradient, "mean_square": mean_square}
+        require_finite(values, f"step {state.step + 1}", _BEGIN_ANEW)
+        moved = on_simplex(moved, state.support)
         return replace(
             state,
             step=state.step + 1,
@@ -439,6 +450,9 @@ def refine_skin(
         problem: rig and options.
         state: where to continue; the beginning by default.
         report: called after every step.
+
+    Raises:
+        NotFinite: if a weight or what moves it is no longer finite.
 
     Source: paper appendix A, L_HD.
     Departs: ends with at most four bones per vertex; the paper leaves their number open.

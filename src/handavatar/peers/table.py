@@ -11,7 +11,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from handavatar.avatar import RenderSettings
-from handavatar.capture.checks import load_json
 from handavatar.capture.frames import Frame, read_capture
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable, step_counter
@@ -29,6 +28,7 @@ from handavatar.train.ablation import (
     trained_shading,
     view_of_frame,
 )
+from handavatar.train.kept import capture_fingerprint, origin, origin_notes, read_kept
 from handavatar.train.loop import METHODS
 from handavatar.train.runs import write_json
 
@@ -43,10 +43,13 @@ class PeersTableOptions:
     Attributes:
         captures: folders of captures whose poses are known, one after the other.
         kept: folder; what was reached on a capture is kept there as ``peers-CAPTURE.json`` and is
-            not measured again with the same steps and seeds.
+            not measured again with the same steps and seeds. Figures of another capture are
+            refused.
         seeds: of all trainings; geometry is fitted once per capture.
         steps: of our shadings.
         peer_steps: of the others.
+        any_commit: kept figures that another commit measured are shown too, and the table says
+            which; else they are refused.
     """
 
     captures: tuple[Path, ...]
@@ -54,6 +57,7 @@ class PeersTableOptions:
     seeds: tuple[int, ...] = (0, 1, 2)
     steps: int = 310
     peer_steps: int = 600
+    any_commit: bool = False
 
     @property
     def total_steps(self) -> int:
@@ -71,7 +75,7 @@ def peers_table(
         report: told the number of trainings done.
 
     Raises:
-        CaptureError: if a capture is damaged.
+        CaptureError: if a capture is damaged, or what is kept is of another capture or commit.
 
     Source: paper Sec. 4.3, comparison with prior art.
     """
@@ -85,12 +89,15 @@ def peers_table(
     }
     for folder in options.captures:
         path = options.kept / f"peers-{folder.name}.json"
-        found = load_json(path) if path.is_file() else {}
+        read_capture(folder)
+        sha256 = capture_fingerprint(folder)
+        found = read_kept(path, sha256, options.any_commit)
         if {name: found.get(name) for name in about} == about:
             for _ in range((len(OURS) + len(PEERS)) * len(options.seeds)):
                 finished()
         else:
-            found = about | {"capture": folder.name, "rows": _measured(folder, options, finished)}
+            rows = _measured(folder, options, finished)
+            found = about | {"capture": folder.name, "rows": rows} | origin(sha256, rows)
             found = json.loads(json.dumps(found))
             make_folder(options.kept, TABLES)
             write_json(path, found)
@@ -190,5 +197,6 @@ def _table(measured: list[dict[str, Any]], options: PeersTableOptions) -> Result
         f"ours and the mesh with {RAYS}x{RAYS} rays a pixel. "
         "Ahead: masked PSNR, decibels, paired by frame, mean over seeds [95 % over frames].",
         *(against(peer, ours) for peer in PEERS for ours in OURS),
+        *origin_notes({str(found["capture"]): found for found in measured}),
     )
     return ResultTable("Prior art", rows, notes)

@@ -17,6 +17,7 @@ from torch import Tensor
 from handavatar.capture.checks import CaptureError
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import write_atomically
+from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
 from handavatar.synthetic.crops import MadeCrops, make_crops
 from handavatar.tracker.measures import TrackerFigures, measure_tracker
 from handavatar.tracker.model import (
@@ -40,6 +41,8 @@ RIG = "open-hand"
 NUM_SKIN_POINTS = 64
 IN_A_FILE = 1000
 """Pictures of a file."""
+_SAVED_EVERY = 120
+"""Seconds between two writings of all that a training needs to go on."""
 _JUDGED_FROM = 1_000_000
 """Seeds from here on are never taught with."""
 _IN_USE = TrackerOptions(turn=0.2, any_turn=0.0, sides=(1.3, 1.6), shift=0.05, mirrored=0.0)
@@ -91,6 +94,8 @@ def train_made_tracker(
 
     Raises:
         CaptureError: nothing to go on with, or a damaged file.
+        NotFinite: the loss, a weight or the optimiser's state is no longer finite; it names what,
+            in which step, and how to go on.
         TrackerError: the file to start from is no tracker, or one of other points.
     """
     tell = report or (lambda doing, done, total, loss: None)
@@ -113,19 +118,25 @@ def train_made_tracker(
     training = TrackerTraining(network.to(options.device), taught, options.steps, options.seed)
     if options.resume:
         try:
-            training.restore(load_file(state_file))
-        except (OSError, SafetensorError, KeyError, RuntimeError) as error:
+            state = load_file(state_file)
+            require_finite(state, "state")
+            training.restore(state)
+        except (OSError, SafetensorError, KeyError, RuntimeError, NotFinite) as error:
             raise CaptureError(
                 f"{state_file} cannot be gone on with ({error})", "train without --resume"
             ) from error
     lessons = draw_lessons(read_pictures(files), training)
-    saved = time.monotonic()
+    saved, written = time.monotonic(), training.step
     for batch in lessons:
         loss = training.teach(batch)
+        is_saved = time.monotonic() - saved > _SAVED_EVERY or training.step == options.steps
+        state = training.state() if is_saved else {}
+        if found := find_not_finite({"loss": loss, **state}):
+            raise NotFinite(f"step {training.step}: {found}", _way_from(options, written))
         tell("training", training.step, options.steps, loss)
-        if time.monotonic() - saved > 120 or training.step == options.steps:
-            write_atomically({state_file: save(training.state())})
-            saved = time.monotonic()
+        if is_saved:
+            write_atomically({state_file: save(state)})
+            saved, written = time.monotonic(), training.step
     tracker = TrainedTracker(training.taught().cpu(), points)
     record = {
         "pictures": IN_A_FILE * len(files),
@@ -135,6 +146,16 @@ def train_made_tracker(
     }
     save_tracker(options.out, tracker, record)
     return tracker
+
+
+def _way_from(options: TrackerTrainOptions, written: int) -> str:
+    """What to do after a step that was not finite; the step of the state that was written."""
+    again = "give the same command again with"
+    rate = f"--rate {options.rate / 2:g}"
+    if not written:
+        return f"{again} {rate}"
+    state_file = options.out.with_suffix(".state")
+    return f"{state_file} holds step {written}, which is good\n{again} --resume {rate}"
 
 
 def evaluate_made_tracker(options: TrackerEvaluateOptions) -> TrackerFigures:

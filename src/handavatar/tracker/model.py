@@ -13,6 +13,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save
 
 from handavatar.jobs.files import write_atomically
+from handavatar.jobs.finite import find_not_finite, require_finite
 from handavatar.jobs.threads import one_thread
 from handavatar.tracker.network import HandNetwork, Told
 from handavatar.tracker.points import TrackedPoints
@@ -57,12 +58,17 @@ def save_tracker(path: Path, tracker: TrainedTracker, record: dict[str, object])
         path: of the file.
         tracker: to write.
         record: what it was taught, kept as JSON.
+
+    Raises:
+        NotFinite: if a weight is NaN or infinite, or too large for half precision; nothing is
+            written then.
     """
     tensors = {
         name: value.half().contiguous() if value.is_floating_point() else value
         for name, value in tracker.network.state_dict().items()
         if not name.endswith("num_batches_tracked")
     }
+    require_finite(tensors, f"{path}: not saved, in half precision", "train with a lower rate")
     points = tracker.points
     header = {
         "schema": str(SCHEMA),
@@ -79,7 +85,7 @@ def read_tracker(path: Path) -> TrainedTracker:
     """Reads a trained tracker.
 
     Raises:
-        TrackerError: if it is none.
+        TrackerError: if it is none, or holds NaN or infinity.
     """
     try:
         with safe_open(path, "pt") as file:
@@ -87,6 +93,8 @@ def read_tracker(path: Path) -> TrainedTracker:
         tensors = {name: values.float() for name, values in load_file(path).items()}
         if header.get("schema") != str(SCHEMA):
             raise TrackerError(f"{path}: is no tracker of schema {SCHEMA}; train it again")
+        if found := find_not_finite(tensors):
+            raise TrackerError(f"{path}: {found}; copy the file again, or train it again")
         points = TrackedPoints(
             header["rig_name"],
             header["rig_sha256"],

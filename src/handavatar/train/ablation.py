@@ -51,6 +51,7 @@ from handavatar.field.shading import (
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.colors import eight_bits
 from handavatar.hand.rig import ShapedHand
+from handavatar.jobs.finite import require_finite
 from handavatar.render.volume import composite_sparse
 from handavatar.train.appearance import (
     SeenSamples,
@@ -451,11 +452,11 @@ def trained_shading(
         values = shading(_rows_of(shown, sample))[:, :3]
         color = composite_sparse(seen.weights[sample], ray, values, len(pixels))
         loss = color_loss(color / seen.alpha[pixels][:, None], seen.colors[pixels])
-        if not math.isfinite(float(loss.detach())):
-            raise FloatingPointError(f"ablation: the loss of step {step + 1} is not finite")
+        require_finite({"loss": loss}, f"ablation, step {step + 1}")
         loss.backward()
         for optimizer in optimizers:
             optimizer.step()
+    require_finite(shading.state_dict(), f"ablation, step {steps}")
     return shading
 
 

@@ -8,11 +8,19 @@ from typing import Any
 
 import torch
 
-from handavatar.capture.checks import load_json
+from handavatar.capture.checks import CaptureError
+from handavatar.capture.frames import read_capture
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable, step_counter
 from handavatar.jobs.files import make_folder
 from handavatar.train.ablation import ROWS, ablate
+from handavatar.train.kept import (
+    capture_fingerprint,
+    origin,
+    origin_notes,
+    read_kept,
+    require_known_origin,
+)
 from handavatar.train.runs import write_json
 
 
@@ -25,11 +33,13 @@ class AblationTableOptions:
             benchmark``), or any, whose split into albedo and light then is not judged.
         kept: folder; what a capture's rows reached is kept there as ``CAPTURE.json`` and is not
             measured again with the same steps and seeds; ``CAPTURE.png`` shows three test frames
-            of the rows that were measured last.
+            of the rows that were measured last. Figures of another capture are refused.
         rows: words that the names of the rows to measure contain, comma-separated, as ``(paper)``;
             by default all rows.
         seeds: of the shadings; geometry is fitted once per capture.
         steps: of each shading.
+        any_commit: kept figures that another commit measured are shown too, and the table says
+            which; else they are refused.
     """
 
     captures: tuple[Path, ...]
@@ -37,6 +47,7 @@ class AblationTableOptions:
     rows: tuple[str, ...] = ()
     seeds: tuple[int, ...] = (0, 1, 2)
     steps: int = 310
+    any_commit: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -67,7 +78,7 @@ def ablation_table(
         report: told the number of rows and seeds done.
 
     Raises:
-        CaptureError: if a capture is damaged.
+        CaptureError: if a capture is damaged, or what is kept is of another capture or commit.
         ValueError: if there is no row of a name.
 
     Source: paper Sec. 4.3, table of ablations; supplement, disentanglement.
@@ -76,17 +87,25 @@ def ablation_table(
     measured = []
     for folder in options.captures:
         path = options.kept / f"{folder.name}.json"
-        kept = load_json(path) if path.is_file() else {}
+        read_capture(folder)
+        sha256 = capture_fingerprint(folder)
+        kept = read_kept(path, sha256, options.any_commit)
         if (kept.get("steps"), kept.get("seeds")) != (options.steps, list(options.seeds)):
             kept = {"rows": {}}
+        if not isinstance(kept.get("rows"), dict):
+            raise CaptureError(f"{path}: holds no rows of figures", "move the file away")
         missing = [name for name in options.names if name not in kept["rows"]]
         for _ in range((len(options.names) - len(missing)) * len(options.seeds)):
             finished()
         if missing:
+            if kept["rows"]:
+                require_known_origin(path, kept)
             picture = options.kept / f"{folder.name}.png"
             found = ablate(folder, missing, options.seeds, options.steps, finished, picture)
             found["rows"] = {**kept["rows"], **found["rows"]}
             found["seeds"] = list(options.seeds)
+            found |= origin(sha256, missing)
+            found["commits"] = {**kept.get("commits", {}), **found["commits"]}
             kept = json.loads(json.dumps(found))
             make_folder(options.kept, TABLES)
             write_json(path, kept)
@@ -130,6 +149,7 @@ def table_of(measured: Sequence[dict[str, Any]], options: AblationTableOptions) 
         "hand hides more of its own sky than in the median frame.",
         "Albedo in decibels after one scale per channel; shading r against true shading; view "
         "spread: how much the light of the same place changes with the camera alone.",
+        *origin_notes({str(found["capture"]): found for found in measured}),
     )
     return ResultTable("Ablation", rows, notes)
 

@@ -31,6 +31,7 @@ from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
 from handavatar.jobs.files import make_folder
 from handavatar.train.attention import attention_figures, attention_picture, read_attention
+from handavatar.train.kept import commit_notes, present_commit
 from handavatar.train.labelled_poses import LabelledPose
 from handavatar.train.prior import (
     PriorEvaluationOptions,
@@ -39,7 +40,7 @@ from handavatar.train.prior import (
     pose_scores,
     train_prior,
 )
-from handavatar.train.provenance import package_versions, source_commit
+from handavatar.train.provenance import package_versions
 from handavatar.train.runs import write_json
 
 Measure = Callable[[OccupancyField, HandCodes, PosedHand], Mapping[str, float]]
@@ -144,12 +145,13 @@ def compare_decoders(
         report: called now and then with what is being trained, the step and current figures.
 
     Returns:
-        A value for JSON: ``options``, ``note``, ``decoders`` (by name: ``parameters``, ``iou``,
-        ``iou_boxes``, ``iou_surface`` in [0, 1], ``iou_points_per_100k``: per cent of IoU for
-        100,000 parameters, the measured columns, ``training_seconds``, ``minus_pair``: intervals
-        of the paired differences by column, ``minus_pair_over_seeds``: the same over seeds, if
-        there are several), ``guides`` (rows of the other guides by name, ``minus_coap`` in place
-        of ``minus_pair``), ``control_hurts`` and ``attention`` if those decoders took part.
+        A value for JSON: ``options``, ``commits`` (of each training), ``note``, ``decoders`` (by
+        name: ``parameters``, ``iou``, ``iou_boxes``, ``iou_surface`` in [0, 1],
+        ``iou_points_per_100k``: per cent of IoU for 100,000 parameters, the measured columns,
+        ``training_seconds``, ``minus_pair``: intervals of the paired differences by column,
+        ``minus_pair_over_seeds``: the same over seeds, if there are several), ``guides`` (rows of
+        the other guides by name, ``minus_coap`` in place of ``minus_pair``), ``control_hurts`` and
+        ``attention`` if those decoders took part.
 
     Raises:
         ValueError: if there is nothing to compare with, or too little to judge by.
@@ -161,6 +163,7 @@ def compare_decoders(
     rows: dict[str, DecoderScores] = {}
     guides: dict[str, DecoderScores] = {}
     attention: dict[str, Any] = {}
+    commits: dict[str, str] = {}
 
     @cache
     def judged_by(rounds: int) -> Judges:
@@ -177,11 +180,14 @@ def compare_decoders(
             _training(options, contender, seed, judged_by, measures, report)
             for seed in options.seeds
         ]
+        for seed, training in zip(options.seeds, trainings, strict=True):
+            commits[f"{contender.name}-{seed}"] = str(training.get("commit"))
         scores = DecoderScores.of(trainings)
         (rows if contender.rounds == options.rounds else guides)[contender.name] = scores
         attention = attention or trainings[0].get("attention", {})
     value: dict[str, Any] = {
         "options": {**asdict(options), "priors": options.priors.name},
+        "commits": commits,
         "note": "Intervals of 95 % over poses, seeds averaged: they tell poses apart, not "
         "trainings; minus_pair_over_seeds tells trainings apart.",
         "decoders": {
@@ -225,6 +231,7 @@ def comparison_table(value: Mapping[str, Any]) -> ResultTable:
             if math.isfinite(interval["mean"])
         ]
         notes.append(f"{name} minus {GUIDED}: {', '.join(differences)}; IoU in [0, 1].")
+    notes += commit_notes("Trainings", value["commits"])
     return ResultTable("Geometry: decoders of the occupancy field", rows, tuple(notes))
 
 
@@ -324,7 +331,7 @@ def _training(
     training = {
         "options": depends_on,
         "versions": package_versions(),
-        "commit": source_commit(),
+        "commit": present_commit(),
         "parameters": sum(parameter.numel() for parameter in field.parameters()),
         "seconds": seconds,
         "columns": {

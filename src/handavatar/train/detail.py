@@ -23,6 +23,7 @@ from handavatar.field.texture import DetailTexture, detailed, texture_at
 from handavatar.geometry.cameras import project
 from handavatar.geometry.meshes import face_cross_products
 from handavatar.geometry.rotations import invert_rigid
+from handavatar.jobs.finite import require_finite
 from handavatar.jobs.threads import mapped
 from handavatar.render.chart import texels_of
 from handavatar.render.rasterize import Fragments, covered_pixels, interpolate, rasterize
@@ -428,6 +429,9 @@ def learn_texels(
         perceptual_weight: of it.
         seed: of the patches.
         tell: hears the number of each step that is done, and its figures.
+
+    Raises:
+        NotFinite: if a loss is NaN or infinite.
     """
     views = [view for view in views if bool(view.is_known.any())]
     if not views or steps == 0:
@@ -457,6 +461,7 @@ def learn_texels(
         loss.backward()
         optimizer.step()
         figures = {"loss": float(loss.detach()), "psnr": -10 * math.log10(max(squared, 1e-10))}
+        require_finite(figures, f"detail, step {step}")
         tell(step, figures)
     with torch.no_grad():
         return start + sum((_enlarged(level, size) for level in levels), torch.zeros_like(start))

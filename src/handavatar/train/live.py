@@ -26,6 +26,7 @@ from safetensors import SafetensorError
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
+from handavatar.jobs.finite import NotFinite
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.progress import told_to
 from handavatar.train.runs import Run
@@ -201,6 +202,8 @@ class _Live:
             return
         try:
             write()
+        except NotFinite:
+            return  # The trainer itself asks after every step, and says what to do.
         except (OSError, SafetensorError) as error:
             self._is_broken = True
             print(

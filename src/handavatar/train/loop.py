@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -21,9 +21,10 @@ from handavatar.evaluate.perceptual import PerceptualChoice, PerceptualLoss, per
 from handavatar.field.shading import CueSet, OrientedCues, PaperCues, TracedCues
 from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
-from handavatar.geometry.meshes import is_inside
+from handavatar.geometry.meshes import SurfacePoints, is_inside
 from handavatar.geometry.rotations import mean_rotation
 from handavatar.hand.rigs import find_rig
+from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
 from handavatar.train.appearance import (
     SeenSamples,
     appearance_loss,
@@ -33,6 +34,13 @@ from handavatar.train.appearance import (
 from handavatar.train.border import border_pixels, fit_border
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.detail import learn_detail
+from handavatar.train.divergence import (
+    divergence_noted,
+    finite_stage,
+    may_take_seed,
+    read_seeds,
+    take_seed,
+)
 from handavatar.train.labelled_poses import sample_points
 from handavatar.train.live import shown_live
 from handavatar.train.losses import border_loss, color_loss, occupancy_loss
@@ -60,8 +68,8 @@ from handavatar.train.runs import (
     append_log,
     create_run,
     default_run_folder,
+    interrupted_run_folder,
     latest_checkpoint,
-    latest_run_folder,
     load_checkpoint,
     locked,
     open_run,
@@ -225,8 +233,8 @@ class TrainOptions:
             that is traced instead of guessed, ``paper`` for the paper's; ``joint`` is ``quick``
             with geometry and appearance learned together from the first step on, for comparison.
         steps: overrides the method's number of steps.
-        resume: ``auto`` continues the newest run of this capture and method (or the one at
-            ``out``) if there is one; ``never`` starts anew.
+        resume: ``auto`` continues the run at ``out``, or by default the last one of this capture
+            and method that was begun and is not finished, if there is one; ``never`` starts anew.
         prior: occupancy prior to start from.
         perceptual: ``auto`` takes LPIPS where its weights are present, else the features of a
             network that the extra ``perceptual`` installs, else the substitute; the run records
@@ -271,7 +279,9 @@ def train(options: TrainOptions) -> Path:
             masks and pictures do not agree (:mod:`handavatar.capture.soundness`).
         RigError: if the rig that the capture's poses belong to is not here.
         CheckpointError: if the run to resume is damaged.
-        FloatingPointError: if the loss is no longer finite; the last checkpoint stays.
+        NotFinite: if a weight, an optimiser's state or a loss is no longer finite; it names what,
+            and in which step. The last checkpoint stays; the run may go on from it with another
+            seed.
         Interrupted: after SIGINT or SIGTERM; a checkpoint was saved.
 
     Source: paper Sec. 4.1 (end-to-end training).
@@ -297,8 +307,12 @@ def train(options: TrainOptions) -> Path:
         training.avatar.info["views"] = views
     run = _open_or_create(options, capture, perceptual.name, steps)
     live = shown_live(run, training.avatar, training.corrections, frames)
-    with locked(run), stop_signals() as stopped, live, _repeatable(device):
+    begun = run.facts["seed"]
+    words = f"--out {run.folder} --resume auto"
+    noted = divergence_noted(run, begun, options.seed, words)
+    with locked(run), stop_signals() as stopped, live, _repeatable(device), noted:
         checkpoint = latest_checkpoint(run)
+        take_seed(run, begun, options.seed, checkpoint.step if checkpoint else 0)
         outlines = _fit_or_restore_outlines(run, checkpoint, training, frames, method, options)
         # Before the checkpoint is loaded: the samples are those of the geometry as it is now.
         seen = None
@@ -315,11 +329,7 @@ def train(options: TrainOptions) -> Path:
                     figures = train_step(
                         training, frames, seen, edges, perceptual, method, step, options.seed
                     )
-                if not all(math.isfinite(value) for value in figures.values()):
-                    raise FloatingPointError(
-                        f"step {step}: the loss is not finite ({figures}); the last checkpoint in "
-                        f"{run.checkpoints} is good: resume from it with another --seed"
-                    )
+                _require_finite_step(training, figures, step)
                 append_log(run, step, figures)
                 progress.update(step, psnr=figures["psnr"], loss=figures["loss"])
                 is_last = step == steps
@@ -327,18 +337,34 @@ def train(options: TrainOptions) -> Path:
                     _save(run, training, outlines, step)
                 if stopped() and not is_last:
                     raise Interrupted(f"stopped at step {step}; continue with --resume auto")
-        _learn_detail(training, capture, frames, seen, perceptual, method, options.seed, stopped)
+        with finite_stage("detail", lambda: model_tensors(training)):
+            _learn_detail(
+                training, capture, frames, seen, perceptual, method, options.seed, stopped
+            )
         count_seen_anchors(training.avatar, corrected_frames(training, frames))
         training.avatar.save(run.avatar)
     return run.folder
 
 
+def _require_finite_step(training: Training, figures: dict[str, float], step: int) -> None:
+    """Refuses a step that leads nowhere: before it is logged, shown or saved."""
+    found = [find_not_finite({"loss": figures}), find_not_finite(model_tensors(training))]
+    if any(found):
+        raise NotFinite(f"step {step}: {'; '.join(text for text in found if text)}")
+
+
 def training_frames(capture: Capture, method: Method) -> list[Frame]:
-    """The frames of split ``train``, as large as the method takes them."""
-    frames = (capture.frame(index) for index in capture.split("train"))
-    if method.picture_size is None:
-        return list(frames)
-    return [frame.binned(method.picture_size) for frame in frames]
+    """The frames of split ``train``, as large as the method takes them.
+
+    Raises:
+        CaptureError: if a frame is damaged, or a number of it is not finite.
+    """
+    frames = []
+    for index in capture.split("train"):
+        frame = capture.frame(index)
+        frame.require_finite()
+        frames.append(frame if method.picture_size is None else frame.binned(method.picture_size))
+    return frames
 
 
 def frames_of_clips(capture: Capture, frames: list[Frame]) -> list[list[Frame]]:
@@ -496,7 +522,13 @@ def begin_training(
     for optimizer in optimizers.values():
         for group in optimizer.param_groups:
             group["initial_lr"] = group["lr"]
-    return Training(avatar, corrections, optimizers)
+    training = Training(avatar, corrections, optimizers)
+    require_finite(
+        model_tensors(training),
+        "before the first step",
+        "check the capture with `handavatar capture check`, and give another prior if you gave one",
+    )
+    return training
 
 
 def _fit_or_restore_outlines(
@@ -520,7 +552,12 @@ def _fit_or_restore_outlines(
         _save(run, training, tensors, 0)
         return tensors
     training.avatar.occupancy.sharpness = method.sharpness
-    tensors = load_checkpoint(checkpoint).tensors["outlines"]
+    stored = load_checkpoint(checkpoint).tensors
+    tensors = stored["outlines"]
+    if "parts" in stored:  # Older checkpoints have none; they are drawn alike.
+        points = SurfacePoints(stored["parts"]["corners"], stored["parts"]["barycentric"])
+        parts = training.avatar.parts.with_points(points)
+        training.avatar.parts = parts.to(training.avatar.device)
     training.avatar.coefficients.copy_(tensors["coefficients"])
     for prefix, module in modules.items():
         module.load_state_dict(_named(tensors, prefix))
@@ -528,9 +565,17 @@ def _fit_or_restore_outlines(
 
 
 def fit_geometry(training: Training, frames: list[Frame], method: Method, seed: int) -> None:
-    """What comes before the first step: poses, shape and decoder, from what the frames show."""
+    """What comes before the first step: poses, shape and decoder, from what the frames show.
+
+    Raises:
+        NotFinite: if one of its stages leaves NaN or infinity.
+    """
+
+    def stage(name: str) -> AbstractContextManager[None]:
+        return finite_stage(name, lambda: model_tensors(training))
+
     if training.corrections is not None:
-        with Progress("registration", 100) as progress:
+        with stage("registration"), Progress("registration", 100) as progress:
             found = register_training(
                 training.avatar,
                 training.corrections,
@@ -539,23 +584,26 @@ def fit_geometry(training: Training, frames: list[Frame], method: Method, seed: 
                 lambda share: progress.update(round(100 * share)),
             )
         training.avatar.info["pose_error"] = round(found.pose_error, 3)
-    fit_outlines(
-        training.avatar,
-        None,
-        corrected_frames(training, frames),
-        method.outline_rounds,
-        method.outline_visits,
-        method.silhouette_size,
-        seed,
-    )
+    with stage("outlines"):
+        fit_outlines(
+            training.avatar,
+            None,
+            corrected_frames(training, frames),
+            method.outline_rounds,
+            method.outline_visits,
+            method.silhouette_size,
+            seed,
+        )
     corrected = corrected_frames(training, frames)
     if method.personal_steps:
         poses = [frame.pose for frame in corrected]
-        fit_occupancy(training.avatar, poses, method.personal_steps, seed)
+        with stage("occupancy"):
+            fit_occupancy(training.avatar, poses, method.personal_steps, seed)
     training.avatar.occupancy.sharpness = method.sharpness
     if method.border_steps:
         settings = learned_rays(method.num_samples)
-        fit_border(training.avatar, corrected, method.border_steps, settings, seed)
+        with stage("border"):
+            fit_border(training.avatar, corrected, method.border_steps, settings, seed)
 
 
 def _outline_modules(training: Training) -> dict[str, torch.nn.Module]:
@@ -805,18 +853,26 @@ def _clear_gradients(training: Training) -> None:
 
 
 def run_folder(options: TrainOptions) -> Path:
-    """Where a training with these options goes on, or begins: ``out``, if that is given."""
+    """Where a training with these options goes on, or begins: ``out``, if that is given.
+
+    Raises:
+        CaptureError: if the capture cannot be read.
+    """
     if options.out is not None:
         return options.out
+    return _default_folder(options, read_capture(options.capture))
+
+
+def _default_folder(options: TrainOptions, capture: Capture) -> Path:
     if options.resume == "auto":
-        begun = latest_run_folder(options.capture, options.method)
-        if begun is not None and not (begun / "avatar.safetensors").exists():
+        begun = interrupted_run_folder(capture.sha256, options.method)
+        if begun is not None:
             return begun
     return default_run_folder(options.capture, options.method)
 
 
 def _open_or_create(options: TrainOptions, capture: Capture, perceptual: str, steps: int) -> Run:
-    folder = run_folder(options)
+    folder = options.out or _default_folder(options, capture)
     if options.resume == "auto" and (folder / "run.json").exists():
         run = open_run(folder)
         _require_same_training(run, options, capture)
@@ -846,7 +902,10 @@ def _require_same_training(run: Run, options: TrainOptions, capture: Capture) ->
             "name another folder with --out, or begin anew with --resume never"
         )
     facts = run.facts
-    then = (facts["capture"]["sha256"], facts["seed"], run.options["method"])
+    seed = read_seeds(run, facts["seed"])[-1].seed
+    if may_take_seed(run, facts["seed"], options.seed):
+        seed = options.seed
+    then = (facts["capture"]["sha256"], seed, run.options["method"])
     now = (capture.sha256, options.seed, options.method)
     for what, old, new in zip(("capture", "seed", "method"), then, now, strict=True):
         if old != new:
@@ -856,12 +915,19 @@ def _require_same_training(run: Run, options: TrainOptions, capture: Capture) ->
             )
 
 
-def _save(run: Run, training: Training, outlines: dict[str, Tensor], step: int) -> None:
+def model_tensors(training: Training) -> dict[str, Tensor]:
+    """Weights, buffers and pose corrections by name, as checkpoints have them."""
     model = {f"avatar.{name}": value for name, value in training.avatar.state_dict().items()}
     if training.corrections is not None:
         state = training.corrections.state_dict()
         model |= {f"corrections.{name}": value for name, value in state.items()}
-    tensors = {"model": model, "outlines": outlines}
+    return model
+
+
+def _save(run: Run, training: Training, outlines: dict[str, Tensor], step: int) -> None:
+    points = training.avatar.parts.points
+    parts = {"corners": points.faces, "barycentric": points.barycentric}
+    tensors = {"model": model_tensors(training), "outlines": outlines, "parts": parts}
     tensors |= {name: optimizer_tensors(part) for name, part in training.optimizers.items()}
     state = {name: optimizer_options(part) for name, part in training.optimizers.items()}
     save_checkpoint(run, step, tensors, state)

@@ -18,6 +18,7 @@ from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import unique_edges
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, Rig
+from handavatar.jobs.finite import require_finite
 from handavatar.jobs.threads import mapped
 from handavatar.render.silhouette import known_at, silhouette_loss, soft_mask, soft_silhouette
 from handavatar.train.corrections import PoseCorrections
@@ -101,6 +102,9 @@ def fit_outlines(
         size: pixels along a side of the compared masks.
         seed: of the order of the frames.
 
+    Raises:
+        NotFinite: if a loss is NaN or infinite.
+
     Departs: the authors start all losses at once.
     """
     if rounds == 0:
@@ -113,7 +117,7 @@ def fit_outlines(
     steps = rounds * visits * -(-len(frames) // _BATCH)
     falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.1 ** (1 / max(steps, 1)))
     with Progress("outlines", passes * len(frames)) as progress:
-        done = 0
+        done = step = 0
         for _ in range(rounds):
             if corrections is not None:
                 done = _align(avatar, corrections, frames, progress, done)
@@ -121,6 +125,8 @@ def fit_outlines(
                 order = torch.randperm(len(frames), generator=generator)
                 for chosen in order.split(_BATCH):
                     value = _shape_step(avatar, corrections, frames, masks, edges, chosen.tolist())
+                    step += 1
+                    require_finite({"silhouette": value}, f"outlines, step {step}")
                     optimizer.step()
                     falling.step()
                     done += len(chosen)

@@ -1,6 +1,5 @@
 """One step of the prior's pre-training: what is minimised, at which rate, and where it goes on."""
 
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -21,6 +20,8 @@ from handavatar.field.occupancy import (
 from handavatar.hand.parts import Parts
 from handavatar.hand.rig import PosedHand
 from handavatar.jobs.files import is_empty, make_folder
+from handavatar.jobs.finite import require_finite
+from handavatar.train.divergence import may_take_seed
 from handavatar.train.labelled_poses import LabelledPose
 from handavatar.train.muon import Muon
 from handavatar.train.optimizer_state import (
@@ -190,6 +191,9 @@ def descend(
         steps: how many.
         rates: highest and last learning rate; see :func:`learning_rate`.
         loss_of_step: the loss of the next step, on samples of its own.
+
+    Raises:
+        NotFinite: if a loss is NaN or infinite.
     """
     optimizers = prior_optimizers(decoder)
     average = math.nan
@@ -203,6 +207,7 @@ def descend(
             for optimizer in optimizers.values():
                 optimizer.step()
             value = float(loss.detach())
+            require_finite({"loss": value}, f"{title}, step {step}")
             average = value if math.isnan(average) else 0.95 * average + 0.05 * value
             progress.update(step, loss=average)
     decoder.zero_grad(set_to_none=True)
@@ -214,15 +219,21 @@ def descend(
 def begin_prior_run(folder: Path, options: Json) -> Run:
     """The folder's run: a new one, or the one that was begun there with the same options.
 
+    One that has diverged goes on with another seed as well.
+
     Raises:
         CheckpointError: if the folder holds something else, or a run with other options.
     """
     run, path = Run(folder), folder / "options.json"
     if path.is_file():
-        begun = json.loads(path.read_text())
+        begun = run.options
         different = sorted(
             name for name in {**begun, **options} if begun.get(name) != options.get(name)
         )
+        old, new = begun.get("seed"), options.get("seed")
+        if isinstance(old, int) and isinstance(new, int):
+            others = [name for name in different if name != "seed"]
+            different = others if may_take_seed(run, old, new) else sorted({*others, "seed"})
         if different:
             raise CheckpointError(
                 f"{folder}: the run there was begun with other options: {', '.join(different)}\n"

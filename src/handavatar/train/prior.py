@@ -31,8 +31,11 @@ from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
 from handavatar.processes import Processes, joined_processes
+from handavatar.train.divergence import divergence_noted, take_seed
 from handavatar.train.labelled_poses import LabelledPose, PoseStream, labelled_pose
+from handavatar.train.optimizer_state import optimizer_tensors
 from handavatar.train.pretraining import (
     OccupancyLoss,
     begin_prior_run,
@@ -128,6 +131,8 @@ def train_prior(
 
     Raises:
         CheckpointError: if ``folder`` holds something else than a run with these options.
+        NotFinite: if a loss, a weight or an optimiser's state is no longer finite; it names what,
+            in which step, and how to go on.
         Interrupted: after SIGINT or SIGTERM; a checkpoint was saved if there is a ``folder``.
         RigError: if there is no such rig, or not at this level.
         ValueError: if the processes cannot share the poses of a step evenly, or for points at
@@ -150,6 +155,8 @@ def train_prior(
             if options.folder is not None and processes.is_first:
                 run = begin_prior_run(options.folder, _what_to_learn(options, base))
                 held.enter_context(locked(run))
+                begun, words = run.options["seed"], f"--folder {options.folder}"
+                held.enter_context(divergence_noted(run, begun, options.seed, words))
             return _trained(options, base, processes, run, stopped, report)
 
 
@@ -184,8 +191,11 @@ def _trained(
     loss_of: nn.Module = OccupancyLoss(field, parts.to(processes.device), times)
     if processes.count > 1:
         loss_of = DistributedDataParallel(loss_of, broadcast_buffers=False)
-    if run is not None and run.log.exists():
-        truncate_log(run, done)
+    if run is not None:
+        take_seed(run, run.options["seed"], options.seed, done)
+        if run.log.exists():
+            truncate_log(run, done)
+    written = 0
     for step in range(done + 1, options.steps + 1):
         first = (step - 1) * options.poses + processes.rank
         own = range(first, step * options.poses, processes.count)
@@ -200,10 +210,20 @@ def _trained(
             for optimizer in optimizers.values():
                 optimizer.step()
         value = float(loss.detach())
-        average = value if math.isnan(average) else 0.99 * average + 0.01 * value
         with times.stage("wait"):
             is_stopped = processes.any(stopped())
         is_last = step == options.steps or is_stopped
+        is_saved = step % options.checkpoint_every == 0 or is_last
+        values: dict[str, object] = {"loss": value, **field.state_dict()}
+        if is_saved:
+            values |= {name: optimizer_tensors(part) for name, part in optimizers.items()}
+        found = find_not_finite(values)
+        # All processes end, or those that found nothing would wait for the others for ever.
+        with times.stage("wait"):
+            if processes.any(found is not None):
+                found = found or "the loss of another process is not finite"
+                raise NotFinite(f"step {step}: {found}", _way_from(options, written))
+        average = value if math.isnan(average) else 0.99 * average + 0.01 * value
         if processes.is_first and (step % 100 == 0 or is_last):
             points = (step - done) * options.poses * options.points
             figures = {"loss": average, "samples_per_second": points / times.seconds}
@@ -212,8 +232,9 @@ def _trained(
                 report(step, figures)
             if run is not None:
                 append_log(run, step, figures)
-        if processes.is_first and (step % options.checkpoint_every == 0 or is_last):
+        if processes.is_first and is_saved:
             save_prior(field, options, base, step)
+            written = step
             if run is not None:
                 save_progress(run, step, field, optimizers, average)
         if is_stopped and step < options.steps:
@@ -224,6 +245,17 @@ def _trained(
             )
             raise Interrupted(f"stopped at step {step}; {way}")
     return field
+
+
+def _way_from(options: PriorOptions, written: int) -> str:
+    """What to do where there is no folder to go on in; the step of the file that was written."""
+    again = "give the same command again with"
+    if not written:
+        return f"{again} --seed {options.seed + 1}"
+    return (
+        f"{options.out} holds the weights of step {written}, which are good\n"
+        f"{again} --start-from {options.out} --seed {options.seed + 1}"
+    )
 
 
 def _what_to_learn(options: PriorOptions, rig: Rig) -> dict[str, Any]:
@@ -239,7 +271,11 @@ def save_prior(field: OccupancyField, options: PriorOptions, rig: Rig, step: int
     """Writes the weights aside and renames them into place.
 
     Of the rig, whose arrays may be licensed, the file holds only name and fingerprint.
+
+    Raises:
+        NotFinite: if a weight is NaN or infinite; nothing is written then.
     """
+    require_finite(field.state_dict(), f"{options.out}: not saved")
     record = {**_what_to_learn(options, rig), "out": options.out.name}
     metadata = {
         "schema": "1",
@@ -268,7 +304,8 @@ def load_prior(
         decoder: which one the weights must be of; shapes alone do not tell.
 
     Raises:
-        CheckpointError: if the file is missing, damaged or of another decoder.
+        CheckpointError: if the file is missing, damaged or of another decoder, or holds NaN or
+            infinity; it names the tensor.
     """
     found = _decoder_of(path)
     if found != decoder:
@@ -277,9 +314,15 @@ def load_prior(
             f"with `handavatar prior train --decoder {decoder}`"
         )
     try:
-        field.load_state_dict(load_file(path))
+        tensors = load_file(path)
+        field.load_state_dict(tensors)
     except Exception as error:
         raise CheckpointError(f"{path} is not a usable occupancy prior: {error}") from error
+    if bad := find_not_finite(tensors):
+        raise CheckpointError(
+            f"{path} is not a usable occupancy prior: {bad}\n"
+            "copy the file again, or leave it out: the prior that ships is good"
+        )
 
 
 def open_prior(path: Path = SHIPPED_PRIOR) -> OccupancyField:

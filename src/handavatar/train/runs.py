@@ -1,14 +1,16 @@
 """The run folder: options, facts, log, checkpoints; survives a kill at any moment.
 
 ```
-run/  options.json  run.json  log.jsonl  avatar.safetensors  .lock  .handavatar
+run/  options.json  run.json  seeds.json  log.jsonl  avatar.safetensors  .lock  .handavatar
       checkpoints/step-000001000/{model,optimizer}.safetensors  state.json  MANIFEST.json
       corrupt/  evaluation/  renders/
 ```
 
 A checkpoint is written aside, synced to disk and renamed into place, so a folder called ``step-*``
-is whole unless the disk itself lied; the manifest's sizes and hashes find that out. Tensors are
-safetensors, the rest is JSON: nothing here can execute what it reads.
+is whole unless the disk itself lied; the manifest's sizes and hashes find that out. What holds NaN
+or infinity is not written, so the newest checkpoint is one to go on from; older versions wrote such
+ones, which are put aside like broken ones. Tensors are safetensors, the rest is JSON: nothing here
+can execute what it reads.
 """
 
 import errno
@@ -44,6 +46,7 @@ from handavatar.jobs.files import (
     refuse_folder_in_use,
     swap_folder,
 )
+from handavatar.jobs.finite import find_not_finite, require_finite
 from handavatar.train.provenance import package_versions, source_commit
 
 Json = dict[str, Any]
@@ -63,7 +66,7 @@ _log = logging.getLogger(__name__)
 def _is_older_run(folder: Path) -> bool:
     """Whether a version that left no marker has begun the run."""
     try:
-        facts = _read_json(folder / "run.json", "")
+        facts = read_json(folder / "run.json", "")
     except (CheckpointError, OSError):
         return False
     return {"schema", "versions", "seed", "capture", "command"} <= facts.keys()
@@ -72,7 +75,7 @@ def _is_older_run(folder: Path) -> bool:
 RUN = FolderKind(
     "run",
     (
-        *("options.json", "run.json", "log.jsonl", "avatar.safetensors", ".lock"),
+        *("options.json", "run.json", "seeds.json", "log.jsonl", "avatar.safetensors", ".lock"),
         *(f"{kept}/step-*/*.{end}" for kept in ("checkpoints", "corrupt") for end in _ENDINGS),
         *(f"live/{name}" for name in ("avatar.safetensors", "progress.json", "watched")),
         *(f"evaluation/{name}" for name in (MARKER, "*.png", "metrics.json", "report.html")),
@@ -110,12 +113,12 @@ class Run:
     @property
     def options(self) -> Json:
         """The options the run was started with."""
-        return _read_json(self.folder / "options.json", "start a new run: handavatar train CAPTURE")
+        return read_json(self.folder / "options.json", "start a new run: handavatar train CAPTURE")
 
     @property
     def facts(self) -> Json:
         """Contents of ``run.json``: versions, commit, seed, capture, command, perceptual loss."""
-        return _read_json(self.folder / "run.json", "start a new run: handavatar train CAPTURE")
+        return read_json(self.folder / "run.json", "start a new run: handavatar train CAPTURE")
 
 
 @dataclass(frozen=True)
@@ -152,10 +155,36 @@ def default_run_folder(capture: Path, method: str, outputs: Path = Path("outputs
     return outputs / capture.resolve().name / method / datetime.now().strftime("%Y-%m-%d_%H%M%S")
 
 
-def latest_run_folder(capture: Path, method: str, outputs: Path = Path("outputs")) -> Path | None:
-    """The newest run of a capture and method that has begun, for ``--resume auto``."""
-    runs = (outputs / capture.resolve().name / method).glob("*/run.json")
-    return max((path.parent for path in runs), default=None, key=lambda folder: folder.name)
+def interrupted_run_folder(
+    capture_sha256: str, method: str, outputs: Path = Path("outputs")
+) -> Path | None:
+    """The run to go on with: of those that are not finished, the one that was begun last.
+
+    What a run is of, when it was begun and whether it is finished it says itself; names and dates
+    of folders say nothing. Of what cannot be read, a warning tells.
+
+    Args:
+        capture_sha256: fingerprint of the capture.
+        method: of the training.
+        outputs: whose runs, three folders deep, are asked.
+    """
+    found: list[tuple[datetime, Path]] = []
+    for path in sorted(outputs.glob("*/*/*/run.json")):
+        run = Run(path.parent)
+        if run.avatar.exists():
+            continue
+        try:
+            facts, options = run.facts, run.options
+            is_of = facts["capture"]["sha256"], options["method"]
+            begun = datetime.fromisoformat(facts["started"])
+        except (CheckpointError, OSError, KeyError, TypeError, ValueError) as error:
+            what = str(error).splitlines()[0] if isinstance(error, CheckpointError) else repr(error)
+            _log.warning("%s: is passed over (%s)", run.folder, what)
+            continue
+        if is_of == (capture_sha256, method):
+            # Without a zone it is local time.
+            found.append((begun.astimezone(), run.folder))
+    return max(found)[1] if found else None
 
 
 def create_run(
@@ -240,7 +269,7 @@ def is_unfinished_start(folder: Path) -> bool:
     if MARKER in names:
         return (read_marker(folder) or {}).get("kind") == RUN.name
     # Before there were markers. Nothing is lost with what is not somebody else's.
-    options = _read_json(folder / "options.json", "") if "options.json" in names else {}
+    options = read_json(folder / "options.json", "") if "options.json" in names else {}
     return "checkpoints" in names and (not options or "avatar_schema" in options)
 
 
@@ -349,8 +378,10 @@ def save_checkpoint(
         state: everything else; JSON values only, no NaN.
 
     Raises:
+        NotFinite: if a tensor or the state holds NaN or infinity; nothing is written then.
         OSError: if the disk is full or refuses; earlier checkpoints stay as they were.
     """
+    require_finite({**tensors, "state": state}, f"checkpoint of step {step}")
     for stem in tensors:
         if not _FILE_NAME.fullmatch(f"{stem}.safetensors"):
             raise ValueError(f"checkpoint file {stem!r}: expected lower-case letters and _")
@@ -394,11 +425,11 @@ def save_checkpoint(
 
 
 def latest_checkpoint(run: Run) -> Checkpoint | None:
-    """The newest checkpoint that is whole; broken ones move to ``corrupt/`` with a warning."""
+    """The newest that is whole and finite; others move to ``corrupt/`` with a warning."""
     for step, folder in _step_folders(run):
         checkpoint = Checkpoint(folder, step)
         try:
-            _verified_payloads(checkpoint)
+            load_checkpoint(checkpoint)
         except CheckpointError as error:
             _log.warning("%s; moved to corrupt/", str(error).splitlines()[0])
             _move_to_corrupt(run, folder)
@@ -411,7 +442,8 @@ def load_checkpoint(checkpoint: Checkpoint) -> CheckpointContents:
     """Reads a checkpoint; every byte is checked against the manifest first.
 
     Raises:
-        CheckpointError: if a file is missing, cut, changed or of another version.
+        CheckpointError: if a file is missing, cut, changed or of another version, or if it holds
+            NaN or infinity.
     """
     payloads = _verified_payloads(checkpoint)
     tensors: dict[str, dict[str, Tensor]] = {}
@@ -425,6 +457,8 @@ def load_checkpoint(checkpoint: Checkpoint) -> CheckpointContents:
                 tensors[path.stem] = safetensors.torch.load(data)
         except (ValueError, RecursionError, SafetensorError) as error:
             raise _broken(path, f"cannot be read ({error})") from error
+    if found := find_not_finite({**tensors, "state": state}):
+        raise _broken(checkpoint.folder, f"cannot be gone on from: {found}")
     return CheckpointContents(tensors, state)
 
 
@@ -520,7 +554,16 @@ def _sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _read_json(path: Path, remedy: str) -> Json:
+def read_json(path: Path, remedy: str) -> Json:
+    """A JSON object from a file of the run.
+
+    Args:
+        path: of the file.
+        remedy: what to do if there is none.
+
+    Raises:
+        CheckpointError: if the file is missing or holds something else.
+    """
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
 from handavatar.field.anchors import Neighbours
+from handavatar.jobs.finite import require_finite
 from handavatar.jobs.threads import mapped
 from handavatar.render.skylight import even_directions
 from handavatar.render.volume import composite_sparse
@@ -64,6 +65,9 @@ def fit_sky(
         num_anchors: of the avatar.
         seed: of the pixels that are looked at.
         clip: whose pictures.
+
+    Raises:
+        NotFinite: if what was fitted is NaN or infinite.
     """
     device = seen.weights.device
     sky = torch.full((seen.light.shape[1],), -3.0, device=device, requires_grad=True)
@@ -86,6 +90,7 @@ def fit_sky(
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
+    require_finite({"brightness": sky}, f"sky of clip {clip}")
     return nn.functional.softplus(sky.detach())
 
 
