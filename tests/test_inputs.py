@@ -156,17 +156,17 @@ def test_a_path_is_what_it_is(place: Path, name: str, kind: str) -> None:
         ("evaluate outputs/capture", "holds runs"),
         # What is not there.
         ("render RUN --motion gesturs", "built|one of gestures(.|\n)*did you mean gestures?"),
-        ("render RUN --motion x.json", "not there; --motion"),
-        ("export RUN glb --out O --motion none.json", "not there; --motion"),
-        ("render RUN --paint none.png", "not there; --paint"),
+        ("render RUN --motion x.json", "no such file or folder; --motion"),
+        ("export RUN glb --out O --motion none.json", "no such file or folder; --motion"),
+        ("render RUN --paint none.png", "no such file or folder; --paint"),
         (
             "edit RUN --out O --paint pictur.png",
-            "not there; --paint(.|\n)*did you mean .*picture.png",
+            "no such file or folder; --paint(.|\n)*did you mean .*picture.png",
         ),
         ("train captures/captur", "did you mean .*captures/capture"),
-        ("render outputs/none", "not there; RUN"),
-        ("capture check none", "not there; CAPTURE"),
-        ("capture webcam --drive none", "not there; --drive"),
+        ("render outputs/none", "no such file or folder; RUN"),
+        ("capture check none", "no such file or folder; CAPTURE"),
+        ("capture webcam --drive none", "no such file or folder; --drive"),
         # Weights of another kind.
         ("render PRIOR", "an occupancy prior; RUN"),
         ("view PRIOR", "an occupancy prior; RUN"),
@@ -182,7 +182,7 @@ def test_a_path_is_what_it_is(place: Path, name: str, kind: str) -> None:
         ("motion from RUN --out O", "finished training; SOURCE"),
         ("motion from avatar.safetensors --out O", "an avatar; SOURCE"),
         ("rig import-mano RUN", "finished training; FILE"),
-        ("rig import-mano none.pkl", "not there; FILE"),
+        ("rig import-mano none.pkl", "no such file or folder; FILE"),
         ("bench --table lift --capture RUN --avatars RUN", "finished training; --capture"),
         ("bench --table speed --avatar captures/capture", "a capture; --avatar"),
     ],
@@ -332,7 +332,7 @@ def test_names_that_are_no_text_are_shown_as_codes(
     name = os.fsdecode(b"hand\xff\x1b[31m.mp4")
     assert cli.main(["capture", "video", str(tmp_path / name), "--out", str(tmp_path / "o")]) == 3
     shown = capsys.readouterr().err
-    assert r"hand\udcff\x1b[31m.mp4: not there" in shown and "\x1b" not in shown
+    assert r"hand\udcff\x1b[31m.mp4: no such file" in shown and "\x1b" not in shown
 
 
 @pytest.mark.parametrize("case", ["frames", "rotations"])

@@ -129,7 +129,10 @@ def test_a_folder_of_something_else_is_not_replaced(
 def test_words_that_mean_nothing_for_a_page_are_refused(
     extra: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["export", str(tmp_path / "none"), "web", "--out", str(tmp_path / "out"), *extra]
+    # By its name it may be an avatar; whoever read it would find that it is none.
+    avatar = tmp_path / "any.safetensors"
+    avatar.write_bytes(b"no avatar")
+    words = ["export", str(avatar), "web", "--out", str(tmp_path / "out"), *extra]
     assert cli.main(words) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

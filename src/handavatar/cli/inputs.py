@@ -52,7 +52,11 @@ class Kind:
 KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
-        Kind("missing", "not there", "look for a slip in the name, and in which folder you are"),
+        Kind(
+            "missing",
+            "no such file or folder",
+            "look for a slip in the name, and in which folder you are",
+        ),
         Kind("empty folder", "an empty folder", "name one that holds something"),
         Kind("folder", "a folder that is neither run nor capture", ""),
         Kind("empty file", "an empty file (0 bytes)", "copy or make it again"),
