@@ -182,7 +182,6 @@ def test_a_path_is_what_it_is(place: Path, name: str, kind: str) -> None:
         ("motion from RUN --out O", "finished training; SOURCE"),
         ("motion from avatar.safetensors --out O", "an avatar; SOURCE"),
         ("rig import-mano RUN", "finished training; FILE"),
-        ("rig import-mano none.pkl", "no such file or folder; FILE"),
         ("bench --table lift --capture RUN --avatars RUN", "finished training; --capture"),
         ("bench --table speed --avatar captures/capture", "a capture; --avatar"),
     ],

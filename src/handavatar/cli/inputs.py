@@ -208,7 +208,8 @@ MOTION_SOURCE = Expected(
 )
 MANO_FILE = Expected(
     "a MANO file (MANO_RIGHT.pkl or MANO_LEFT.pkl)",
-    ("pickle", "other"),
+    # One that is missing has an exit code of its own, and words on where to get it.
+    ("missing", "pickle", "other"),
     "get it from https://mano.is.tue.mpg.de",
 )
 
