@@ -137,8 +137,10 @@ def test_a_missing_file_is_exit_4_and_a_hostile_one_exit_3(
     assert cli.main(["rig", "import-mano", str(path)]) == 3
     assert "os.system" in capsys.readouterr().err
     assert not home.exists()
-    words = ["capture", "video", "a.mp4", "--out", str(tmp_path / "c"), "--rig", "mano-right"]
-    assert cli.main(words) == 4
+    # By its name it is a video; whoever read it would find that it is none.
+    (tmp_path / "a.mp4").write_bytes(b"no video")
+    words = ["capture", "video", str(tmp_path / "a.mp4"), "--out", str(tmp_path / "c")]
+    assert cli.main([*words, "--rig", "mano-right"]) == 4
 
 
 def test_import_writes_where_it_is_told_and_nothing_else(
