@@ -16,16 +16,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from conftest import avatar_of_the_prior, write_tiny_capture
+from conftest import avatar_of_the_prior, camera_above, lit_frame, write_tiny_capture
 from fuzzing import changed_bytes, changed_json_bytes, changed_tensors, fault_of
 from PIL import Image
 from safetensors.torch import save_file
 
-from handavatar.avatar import HandAvatar
+from handavatar.avatar import HandAvatar, RenderSettings
 from handavatar.capture.frames import read_capture
 from handavatar.capture.motion import Motion, open_motion, write_motion
 from handavatar.capture.motion_import import MotionFromOptions, motion_from
 from handavatar.capture.soundness import find_problems
+from handavatar.capture.view import start_of, view_of
 from handavatar.cli.inputs import kind_of
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import HandPose
@@ -35,11 +36,14 @@ from handavatar.tracker.model import read_tracker
 from handavatar.train.live import LiveState, live_folder, read_live
 from handavatar.train.prior import SHIPPED_PRIOR, open_prior
 from handavatar.train.runs import (
+    Checkpoint,
     Run,
     append_log,
     create_run,
+    load_checkpoint,
     open_run,
     read_log,
+    save_checkpoint,
     truncate_log,
 )
 
@@ -59,6 +63,19 @@ class Format:
     file: Path
     mutate: Mutate
     read: Callable[[], Any]
+
+
+def _avatar(folder: Path, avatar: HandAvatar) -> Format:
+    file = folder / "avatar.safetensors"
+    avatar.info["view"] = view_of([lit_frame(0, "train", size=8)])
+    avatar.save(file)
+
+    def read() -> None:
+        loaded = HandAvatar.load(file)
+        start = start_of(loaded.view())
+        loaded.render(start, camera_above(8), settings=RenderSettings(num_samples=4))
+
+    return Format(file, changed_tensors, read)
 
 
 def _rig(folder: Path, avatar: HandAvatar) -> Format:
@@ -177,6 +194,15 @@ def _run_log(folder: Path, avatar: HandAvatar) -> Format:
     return Format(run.log, mutate, read)
 
 
+def _checkpoint(folder: Path, avatar: HandAvatar) -> Format:
+    run = _run(folder)
+    save_checkpoint(run, 7, {"model": {"a": torch.zeros(3)}}, {"adam": {"lr": 0.1}})
+    step = run.checkpoints / "step-000000007"
+    return Format(
+        step / "MANIFEST.json", changed_json_bytes, lambda: load_checkpoint(Checkpoint(step, 7))
+    )
+
+
 def _progress(folder: Path, avatar: HandAvatar) -> Format:
     run = _run(folder)
     live_folder(run).mkdir()
@@ -205,6 +231,8 @@ def _run(folder: Path) -> Run:
 
 
 FORMATS: dict[str, Callable[[Path, HandAvatar], Format]] = {
+    "avatar": _avatar,
+    "checkpoint": _checkpoint,
     "rig": _rig,
     "capture": _capture,
     "frame": _frame,

@@ -38,7 +38,7 @@ from handavatar.field.texture import DetailTexture
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
 from handavatar.hand.parts import finer_rig
-from handavatar.hand.pose import HandPose
+from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.rig import RIG_ARRAYS, PosedHand, Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
 from handavatar.jobs.finite import find_not_finite, require_finite
@@ -93,6 +93,15 @@ def _stored_edit(about: dict[str, Any], tensors: dict[str, Tensor]) -> Edit:
     )
 
 
+_DAMAGE = (KeyError, IndexError, RuntimeError, TypeError, ValueError, OverflowError)
+"""What a header or tensors that do not belong together make of reading them."""
+_KINDS: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("rig", "rig_sha256", "cues"), (str,)),
+    **dict.fromkeys(("margin", "softness", "sharpness"), (int, float)),
+    **dict.fromkeys(("edit", "info"), (dict,)),
+    "rounds": (int,),
+}
+_VIEW = {"camera_from_world": (4, 4), "rotations": (NUM_BONES, 3), "translation": (3,)}
 _MAX_BYTES = 1 << 30
 """Of an avatar file; 10 to 100 MB are usual."""
 _MAX_DIRECTIONS = 1024
@@ -954,6 +963,7 @@ class HandAvatar(nn.Module):
         if about.get("rig_is_licensed"):
             licensed_rig = find_rig(str(about.get("rig_sha256")), str(about.get("rig")))
         try:
+            _require_sound_header(about)
             rig = licensed_rig or _stored_rig(about["rig"], tensors)
             state = {name[7:]: v for name, v in tensors.items() if name.startswith("avatar.")}
             anchors = SurfacePoints(state["anchor_corners"], state["anchor_barycentric"])
@@ -973,7 +983,8 @@ class HandAvatar(nn.Module):
                 part_points=_stored_part_points(tensors),
             )
             avatar._restore(about, tensors)
-        except (KeyError, RuntimeError, TypeError, ValueError) as error:
+            avatar.view()
+        except _DAMAGE as error:
             raise CheckpointError(f"{path}: not a complete avatar ({error})") from error
         return avatar
 
@@ -989,6 +1000,7 @@ class HandAvatar(nn.Module):
         about, tensors = _stored(path)
         avatar = copy.deepcopy(self)
         try:
+            _require_sound_header(about)
             if (about["rig_sha256"], about["rounds"]) != (self.base_rig.sha256, self.rounds):
                 raise ValueError("it is of another rig")
             points = _stored_part_points(tensors)
@@ -998,7 +1010,7 @@ class HandAvatar(nn.Module):
                 parts = self.parts.with_points(points)
             avatar.parts = parts.to(self.device)
             avatar._restore(about, tensors)
-        except (KeyError, RuntimeError, TypeError, ValueError) as error:
+        except _DAMAGE as error:
             raise CheckpointError(f"{path}: not a state of this avatar ({error})") from error
         return avatar
 
@@ -1060,6 +1072,30 @@ def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             f"handavatar train CAPTURE --out {path.parent} --resume auto"
         )
     return about, tensors
+
+
+def _require_sound_header(about: dict[str, Any]) -> None:
+    """Refuses a header whose values are of other kinds than :meth:`HandAvatar.save` writes.
+
+    Raises:
+        ValueError: which value, what it is, and what was expected.
+        KeyError: which is missing.
+    """
+    for name, kinds in _KINDS.items():
+        value = about[name]
+        if not isinstance(value, kinds) or isinstance(value, bool):
+            expected = " or ".join(kind.__name__ for kind in kinds)
+            raise ValueError(f"{name} is {str(value)[:40]!r}, expected {expected}")
+    info = about["info"]
+    views = info.get("views") or []
+    if not isinstance(views, list) or info.get("side", "right") not in ("left", "right"):
+        raise ValueError("info: views is no list, or side neither left nor right")
+    for view in [*views, *([info["view"]] if info.get("view") is not None else [])]:
+        if not isinstance(view, dict):
+            raise ValueError(f"info: a view is {str(view)[:40]!r}, expected an object")
+        for name, shape in _VIEW.items():
+            if torch.tensor(view[name], dtype=torch.float64).shape != shape:
+                raise ValueError(f"info: {name} of a view has not the shape {shape}")
 
 
 def _copied_state(state: HandState) -> HandState:

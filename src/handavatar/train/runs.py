@@ -474,7 +474,10 @@ def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
         schema, step = int(manifest["schema"]), int(manifest["step"])
     except FileNotFoundError as error:
         raise _broken(path, "is missing") from error
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (
+        *(ValueError, KeyError, TypeError, AttributeError),
+        *(RecursionError, OverflowError),
+    ) as error:
         raise _broken(path, "is not a manifest (cut or overwritten)") from error
     if schema > _SCHEMA:
         raise CheckpointError(
