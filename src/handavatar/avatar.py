@@ -58,6 +58,8 @@ START_LIGHT = 0.65
 """Illumination of an untrained avatar: room to grow brighter and darker."""
 _FEW_ON_A_GPU = 1 << 18
 """Samples that a GPU evaluates all at once in less time than it takes to choose among them."""
+_LARGEST = 1e8
+"""Of the weights of an avatar file."""
 _OF_LICENSED_RIG = ("illumination.position_codes",)
 """Weights that a licensed rig's arrays could be read from; they follow from the rig."""
 
@@ -965,7 +967,19 @@ class HandAvatar(nn.Module):
         try:
             _require_sound_header(about)
             rig = licensed_rig or _stored_rig(about["rig"], tensors)
+            if rig.sha256 != about["rig_sha256"]:
+                raise ValueError(
+                    f"its rig's fingerprint is {rig.sha256[:12]}, the file says "
+                    f"{about['rig_sha256'][:12]}"
+                )
             state = {name[7:]: v for name, v in tensors.items() if name.startswith("avatar.")}
+            _require_possible(state)
+            coefficients, known = state["coefficients"], rig.shape_directions[0, 0]
+            if (coefficients.shape, coefficients.dtype) != (known.shape, known.dtype):
+                raise ValueError(
+                    f"{tuple(coefficients.shape)} shape coefficients, {coefficients.dtype}, "
+                    f"expected {tuple(known.shape)}, {known.dtype}"
+                )
             anchors = SurfacePoints(state["anchor_corners"], state["anchor_barycentric"])
             cues = cue_set(about["cues"], len(state["illumination.directions"]))
             if len(state["illumination.directions"]) > _MAX_DIRECTIONS:
@@ -975,7 +989,7 @@ class HandAvatar(nn.Module):
                 raise ValueError(f"{columns} lights, at most {_MAX_LIGHTS} make sense")
             avatar = HandAvatar(
                 rig,
-                state["coefficients"],
+                coefficients,
                 rounds=about["rounds"],
                 anchors=anchors,
                 cues=cues,
@@ -1034,6 +1048,19 @@ class HandAvatar(nn.Module):
         self.load_state_dict(state)
         self.edit = _stored_edit(about["edit"], tensors)
         self.light_of()
+
+
+def _require_possible(state: dict[str, Tensor]) -> None:
+    """Weights so large that they are damage: what is computed with them is not finite.
+
+    Raises:
+        ValueError: if there is one; it names the tensor.
+    """
+    for name, value in state.items():
+        if value.is_floating_point() and value.numel() and float(value.abs().max()) > _LARGEST:
+            raise ValueError(
+                f"{name} holds {float(value.abs().max()):.3g}, expected at most {_LARGEST:g}"
+            )
 
 
 def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:

@@ -1,11 +1,11 @@
 """Captures that are wrong in one way each, made of a good one; and in which words it must be said.
 
-The source is every third frame of the capture that ships, whose poses are exact.
+The source is every fifth frame of the capture that ships, whose poses are exact.
 """
 
 import json
 import math
-import os
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,21 +43,20 @@ class Scene:
             return np.array(picture)
 
     def write(self, number: int, kind: str, pixels: Pixels, **options: object) -> None:
-        """Gives the copy other pixels; those of the source are the same file and stay."""
+        """Gives the copy other pixels."""
         path = self.folder / self.frames[number][kind]
-        path.unlink()
         Image.fromarray(np.ascontiguousarray(pixels)).save(path, **options)
 
 
 def copied(source: Path, folder: Path, stride: int = 1) -> Scene:
-    """A copy of a capture's pictures, masks and poses; pixels are shared until they are changed."""
+    """A copy of a capture's pictures, masks and poses."""
     content = json.loads((source / "transforms.json").read_text())
     content["frames"] = content["frames"][::stride]
     for entry in content["frames"]:
         for kind in ("file_path", "mask_path"):
             path = folder / entry[kind]
             path.parent.mkdir(parents=True, exist_ok=True)
-            os.link(source / entry[kind], path)
+            shutil.copyfile(source / entry[kind], path)
     return Scene(folder, content)
 
 

@@ -78,6 +78,7 @@ class Rig:
 
     def __post_init__(self) -> None:
         """Refuses arrays that contradict each other."""
+        self._require_shapes()
         num_vertices = len(self.template_vertices)
         if self.pose_directions.numel() == 0:
             none = self.template_vertices.new_zeros(num_vertices, 3, 0)
@@ -87,11 +88,6 @@ class Rig:
                 f"rig {self.name}: pose_directions have shape "
                 f"{tuple(self.pose_directions.shape)}, expected "
                 f"({num_vertices}, 3, {NUM_POSE_FEATURES})"
-            )
-        if self.skin_weights.shape != (num_vertices, NUM_BONES):
-            raise RigError(
-                f"rig {self.name}: skin_weights have shape {tuple(self.skin_weights.shape)}, "
-                f"expected ({num_vertices}, {NUM_BONES})"
             )
         for label in (
             "template_vertices",
@@ -110,6 +106,30 @@ class Rig:
         sums = self.skin_weights.sum(-1)
         if not torch.allclose(sums, torch.ones_like(sums), atol=1e-4):
             raise RigError(f"rig {self.name}: rows of skin_weights do not sum to 1")
+
+    def _require_shapes(self) -> None:
+        """Files may hold anything: what is computed with these arrays relies on their shapes."""
+        vertices, faces = len(self.template_vertices), len(self.faces)
+        floats: dict[str, tuple[int, ...]] = {
+            "template_vertices": (vertices, 3),
+            "skin_weights": (vertices, NUM_BONES),
+            "joint_regressor": (NUM_BONES, vertices),
+            "shape_directions": (vertices, 3, *self.shape_directions.shape[2:][:1]),
+            "uv_coordinates": (len(self.uv_coordinates), 2),
+            "joint_axes": (NUM_BONES, 3, 3),
+        }
+        whole = {"faces": (faces, 3), "uv_faces": (faces, 3)}
+        for label, shape in {**floats, **whole}.items():
+            found = getattr(self, label)
+            if tuple(found.shape) != shape:
+                raise RigError(
+                    f"rig {self.name}: {label} have shape {tuple(found.shape)}, expected {shape}"
+                )
+            if found.is_floating_point() != (label in floats):
+                kind = "floating-point" if label in floats else "whole"
+                raise RigError(
+                    f"rig {self.name}: {label} are {found.dtype}, expected {kind} numbers"
+                )
 
     @property
     def num_vertices(self) -> int:
