@@ -6,11 +6,14 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from bad_captures import BAD_CAPTURES, BadCapture, copied
 from conftest import lit_frame, write_tiny_capture
+from scipy.ndimage import binary_dilation, distance_transform_edt
 
+from handavatar.capture.agreement import SkinColors, SmallFrame, shifted
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.default import default_capture
 from handavatar.capture.degraded import DegradeOptions, degrade_capture
@@ -124,6 +127,35 @@ def test_where_nothing_is_known_nothing_is_compared(tmp_path: Path) -> None:
     header = dict(rig_name=rig.name, rig_sha256=rig.sha256, subject="s", source="s", licence="s")
     write_capture(tmp_path / "capture", frames, **header)
     assert find_problems(tmp_path / "capture") == []
+
+
+def test_edges_of_a_background_are_no_other_hand(tmp_path: Path) -> None:
+    scene = copied(default_capture().folder, tmp_path / "capture", 8)
+    number = 5
+    pixels, mask = (scene.pixels(number, kind) for kind in ("file_path", "mask_path"))
+    is_hand = mask > 127
+    # As the skin all around, with a bright line that has the hand's very outline elsewhere.
+    nearest = distance_transform_edt(~is_hand, return_distances=False, return_indices=True)
+    pixels = pixels[tuple(nearest)]
+    border = binary_dilation(is_hand, iterations=3) & ~is_hand
+    pixels[np.roll(border, (12, -20), (0, 1)) & ~is_hand] = 255
+    scene.write(number, "file_path", pixels)
+    (scene.folder / "transforms.json").write_text(json.dumps(scene.content))
+    assert find_problems(scene.folder) == []
+
+
+def test_skin_colors_tell_the_hand_from_what_is_beside_it() -> None:
+    mask = torch.zeros(16, 16, dtype=torch.bool)
+    mask[4:12, 4:8] = True
+    colors = torch.where(mask, 0.8, 0.2).expand(3, 16, 16)
+    known = torch.ones(16, 16, dtype=torch.bool)
+    frame = SmallFrame(mask, mask, known, colors, torch.zeros(16, 16), 16, 16, 1.0)
+    skin = SkinColors([frame])
+    own = skin.contrast(frame, mask)
+    moved = shifted(mask, 2, -3)
+    assert torch.equal(moved.nonzero(), mask.nonzero() + torch.tensor([-3, 2]))
+    assert own > 5 > skin.contrast(frame, moved) > skin.contrast(frame, ~mask)
+    assert skin.contrast(frame, known) == 0
 
 
 def test_a_shape_that_nobody_knows_is_the_mean_one(tmp_path: Path) -> None:

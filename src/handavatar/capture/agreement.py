@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import interpolate, max_pool2d, pad
 
@@ -21,6 +21,8 @@ _HAND_PIXELS = 48
 """Along a hand in the small pictures: a finger is about five wide."""
 _SAMPLES = 8
 """Stored pixels in a row that make one of a small picture, at most about twice as many."""
+_COLOR_BINS = 16
+"""Of each channel."""
 _SIDES = (64, 256)
 """Of the small pictures, pixels along the longer side: at least, at most."""
 
@@ -50,6 +52,7 @@ class SmallFrame:
         mask: where the stored mask says hand.
         mesh: what the posed mesh covers.
         known: where the mask means anything, in the picture.
+        colors: of the picture at the capture's average exposure, in [0, 1] or a little above.
         edges: how much the picture's colours change there, at least 0; 0 where not known.
         height: of the picture in it, pixels.
         width: of the picture in it, pixels.
@@ -59,6 +62,7 @@ class SmallFrame:
     mask: Bool[Tensor, "side side"]
     mesh: Bool[Tensor, "side side"]
     known: Bool[Tensor, "side side"]
+    colors: Float[Tensor, "3 side side"]
     edges: Float[Tensor, "side side"]
     height: int
     width: int
@@ -108,6 +112,7 @@ def small_frame(frame: Frame, hand: ShapedHand, side: int) -> SmallFrame:
         mask=pad(mask, room),
         mesh=pad(mesh & known, room),
         known=pad(known, room),
+        colors=pad(colors / frame.gain[:, None, None], room),
         edges=pad(_edges(colors, known), room),
         height=size[0],
         width=size[1],
@@ -208,6 +213,57 @@ def shifted_border(
     down, right = divmod(best, 2 * side)
     down, right = (each - 2 * side if each >= side else each for each in (down, right))
     return float(scores.flatten()[best] / edges.mean().clamp_min(1e-6)), (right, down)
+
+
+def shifted(mask: Bool[Tensor, "side side"], right: int, down: int) -> Bool[Tensor, "side side"]:
+    """A mask moved by whole pixels; what leaves the square is lost.
+
+    Args:
+        mask: to be moved.
+        right: pixels; negative to the left.
+        down: pixels; negative upwards.
+    """
+    height, width = mask.shape
+    moved = pad(mask, (max(right, 0), max(-right, 0), max(down, 0), max(-down, 0)))
+    return moved[max(-down, 0) :, max(-right, 0) :][:height, :width]
+
+
+class SkinColors:
+    """How much more often a colour is seen inside the masks of all frames than outside of them."""
+
+    def __init__(self, frames: Sequence[SmallFrame]) -> None:
+        """Counts the colours of known pixels.
+
+        Args:
+            frames: of one capture.
+        """
+        counts = torch.ones(2, _COLOR_BINS**3)
+        for frame in frames:
+            bins = self._bins(frame)
+            for place, region in enumerate((frame.mask, ~frame.mask & frame.known)):
+                counts[place] += torch.bincount(bins[region], minlength=_COLOR_BINS**3)
+        shares = counts / counts.sum(1, keepdim=True)
+        self._log_ratios = (shares[0] / shares[1]).log()
+
+    def contrast(self, frame: SmallFrame, mask: Bool[Tensor, "side side"]) -> float:
+        """How clearly a mask parts hand from background in a frame, by their colours.
+
+        Args:
+            frame: one of those that were counted, or of the same capture.
+            mask: any.
+
+        Returns:
+            Mean logarithm of the ratio inside less that outside; 0 where one of both is empty.
+        """
+        inside, outside = mask & frame.known, ~mask & frame.known
+        if not bool(inside.any()) or not bool(outside.any()):
+            return 0.0
+        ratios = self._log_ratios[self._bins(frame)]
+        return float(ratios[inside].mean() - ratios[outside].mean())
+
+    def _bins(self, frame: SmallFrame) -> Int[Tensor, "side side"]:
+        red, green, blue = (frame.colors * _COLOR_BINS).long().clamp(0, _COLOR_BINS - 1)
+        return (red * _COLOR_BINS + green) * _COLOR_BINS + blue
 
 
 def edge_scores(

@@ -24,9 +24,11 @@ from torch import Tensor
 from handavatar.capture.agreement import (
     TURNED_BACK,
     TURNS,
+    SkinColors,
     SmallFrame,
     edge_scores,
     overlap,
+    shifted,
     shifted_border,
     shifted_overlap,
     small_camera,
@@ -304,6 +306,7 @@ class _Comparison:
         self._meshes = torch.stack([each.small.mesh for each in seen])
         self._edges = torch.stack([each.small.edges for each in seen])
         self._scores = edge_scores(self._edges, self._masks)
+        self._skin = SkinColors([each.small for each in seen])
         self._own = self._scores.diag()
         overlaps = torch.tensor([each.overlap for each in seen])
         # Masks that lie on the hand tell how clearly pictures show their borders.
@@ -559,26 +562,31 @@ class _Comparison:
         own, small = float(self._own[number]), self._seen[number].small
         edges = self._edges[number][None]
         is_faint = own < _FAINT * self._usual_best
-        found: list[tuple[float, str, str]] = []
+        found: list[tuple[float, Tensor, str, str]] = []
         for turn, function in TURNS.items():
             mask = turned(small.mask, function, small.height, small.width)
             if mask is not None and float(overlap(mask, small.mask)) < _SAME_MASK:
                 score = float(edge_scores(edges, mask[None]))
-                found.append((score, f"is {turn} against its mask", "turn its pixels back"))
+                found.append((score, mask, f"is {turn} against its mask", "turn its pixels back"))
         best, shift = self._shifts[number]
         is_common = math.dist(shift, self._usual_shift) < _MOVED
         if math.hypot(*shift) > _MOVED and (is_common or is_faint):
             place = _offset(shift[0] * small.scale, shift[1] * small.scale)
             what = f"shows the hand {place} of its mask"
-            found.append((best, what, "crop and pad picture and mask alike"))
+            moved = shifted(small.mask, *shift)
+            found.append((best, moved, what, "crop and pad picture and mask alike"))
         other = int(self._scores[number].argmax())
         if is_faint:
             what = f"belongs to another mask; that of {self._name(other)} fits it"
             remedy = "give every frame its own picture"
-            found.append((float(self._scores[number, other]), what, remedy))
-        best, what, remedy = max(found)
-        if best > _TELLING * max(own, 1.0):
-            return _Cause(False, f"the picture {what}", remedy)
+            found.append((float(self._scores[number, other]), self._masks[other], what, remedy))
+        # Backgrounds have edges too; what lies within them has not the colours of this hand.
+        contrast = self._skin.contrast(small, small.mask)
+        for score, mask, what, remedy in sorted(found, key=lambda each: -each[0]):
+            if score <= _TELLING * max(own, 1.0):
+                break
+            if self._skin.contrast(small, mask) > contrast:
+                return _Cause(False, f"the picture {what}", remedy)
         if own < _NOTHING * self._usual_own or self._usual_own < _CHANCE:
             return _Cause(
                 False,
