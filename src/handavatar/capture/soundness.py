@@ -124,7 +124,12 @@ def require_sound(capture: Capture) -> None:
         CaptureError: the first problem with its frame, its cause and a remedy, and how many more.
         RigError: the rig of its poses is not here.
     """
-    problems = _problems_of_frames(capture, shaped_hand(capture), None)
+    try:
+        hand = shaped_hand(capture)
+    except CaptureError as error:
+        what = f"{capture.folder / 'transforms.json'}: {error.what}"
+        raise CaptureError(what, error.remedy) from error
+    problems = _problems_of_frames(capture, hand, None)
     if problems:
         rest = len(problems) - 1
         more = f"\nand {rest} more: handavatar capture check {capture.folder}" if rest else ""
@@ -150,7 +155,7 @@ def shaped_hand(capture: Capture) -> ShapedHand:
             "write those of this rig, or leave them out",
         )
     largest = float(capture.shape_coefficients.abs().amax()) if found else 0.0
-    if largest > _MOST_SHAPE:
+    if not largest <= _MOST_SHAPE:
         raise CaptureError(
             f"a shape coefficient is {largest:.3g} standard deviations, at most {_MOST_SHAPE:g} "
             "make sense",
@@ -214,6 +219,7 @@ def _problems_of_frames(
         for index, record in enumerate(capture.records):
             try:
                 frame = capture.frame(index)
+                frame.require_finite()
                 problem = _problem_of_pixels(frame, record)
             except CaptureError as error:
                 problem = Problem(record.file_path, record.name, error.what, error.remedy)
