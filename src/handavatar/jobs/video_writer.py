@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 _BT709 = 1
 # With AVX2 x264 now and then decides differently about the same pictures. Without, processors of
 # every age write the same bytes, no slower.
-_SAME_EVERYWHERE = (
+_SAME_EVERYWHERE: dict[str, object] = (
     {"x264-params": "asm=AVX"} if platform.machine().lower() in ("x86_64", "amd64") else {}
 )
 
