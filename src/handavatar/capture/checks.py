@@ -5,6 +5,7 @@ Every check raises :class:`CaptureError` with what was found and what to do; cal
 
 import json
 import math
+import re
 from collections import Counter
 from io import BytesIO
 from pathlib import Path, PurePosixPath
@@ -19,6 +20,21 @@ MAX_JSON_CONTAINERS = 4_000_000
 has 1.7 million, a capture of as many frames 2.5."""
 MAX_PIXELS = 64_000_000
 MAX_TEXT = 2000
+PICTURE_FORMATS = {
+    ".png": "PNG",
+    ".jpg": "JPEG",
+    ".jpeg": "JPEG",
+    ".webp": "WEBP",
+    ".bmp": "BMP",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".ppm": "PPM",
+}
+"""Of files of pictures, by the ends of their names."""
+OPTIONAL_FORMATS = {".heic": "HEIF", ".heif": "HEIF"}
+"""Those that only an extra can read."""
+NUMBERED = re.compile(r"%0?(\d*)d")
+"""In a pattern: where a picture's number stands."""
 _ORIENTATION = 0x0112
 """Tag of EXIF; 1 is upright, and so is 0, which some programs write for not knowing."""
 
@@ -198,6 +214,15 @@ def picture_in(
             f"{name} is {width} x {height}, more than {megapixels} megapixels", "make it smaller"
         )
     return picture
+
+
+def is_pattern(name: str) -> bool:
+    """Whether a file's name stands for several: ``*.png``, ``frame_%04d.png``.
+
+    Args:
+        name: without its folder.
+    """
+    return any(sign in name for sign in "*?[") or NUMBERED.search(name) is not None
 
 
 def is_to_be_turned(picture: Image.Image) -> bool:

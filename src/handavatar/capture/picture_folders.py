@@ -9,7 +9,15 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageCms, ImageOps
 
-from handavatar.capture.checks import CaptureError, decoded, picture_in
+from handavatar.capture.checks import (
+    NUMBERED,
+    OPTIONAL_FORMATS,
+    PICTURE_FORMATS,
+    CaptureError,
+    decoded,
+    is_pattern,
+    picture_in,
+)
 from handavatar.capture.decoding import (
     MAX_PIXELS,
     Sampling,
@@ -21,19 +29,6 @@ from handavatar.capture.decoding import (
     video_frames,
     working_size,
 )
-
-_FORMATS = {
-    ".png": "PNG",
-    ".jpg": "JPEG",
-    ".jpeg": "JPEG",
-    ".webp": "WEBP",
-    ".bmp": "BMP",
-    ".tif": "TIFF",
-    ".tiff": "TIFF",
-    ".ppm": "PPM",
-}
-_OPTIONAL = {".heic": "HEIF", ".heif": "HEIF"}
-_COUNTED = re.compile(r"%0?(\d*)d")
 
 
 def frames_of(source: Path, sampling: Sampling, tell: Tell) -> Iterator[VideoFrame]:
@@ -91,11 +86,7 @@ def picture_frames(source: Path, sampling: Sampling, tell: Tell) -> Iterator[Vid
 
 def is_picture_source(source: Path) -> bool:
     """Whether a folder or a pattern is meant, and not a video."""
-    return source.is_dir() or (not source.is_file() and _is_pattern(source.name))
-
-
-def _is_pattern(name: str) -> bool:
-    return any(sign in name for sign in "*?[") or _COUNTED.search(name) is not None
+    return source.is_dir() or (not source.is_file() and is_pattern(source.name))
 
 
 def picture_files(source: Path, tell: Tell) -> list[Path]:
@@ -110,16 +101,16 @@ def picture_files(source: Path, tell: Tell) -> list[Path]:
     """
     if source.is_dir():
         folder, found = source, sorted(source.iterdir())
-    elif _COUNTED.search(source.name):
+    elif NUMBERED.search(source.name):
         folder = source.parent
-        before, after = _COUNTED.split(source.name, maxsplit=1)[::2]
+        before, after = NUMBERED.split(source.name, maxsplit=1)[::2]
         name = re.compile(re.escape(before) + r"\d+" + re.escape(after))
         found = [file for file in _entries(folder) if name.fullmatch(file.name)]
     else:
         folder = source.parent
         found = [file for file in _entries(folder) if file.match(source.name)]
     found = [file for file in found if file.is_file() and not file.name.startswith(".")]
-    known = _FORMATS | _OPTIONAL
+    known = PICTURE_FORMATS | OPTIONAL_FORMATS
     files = [file for file in found if file.suffix.lower() in known]
     if not files:
         raise CaptureError(
@@ -150,7 +141,7 @@ def open_picture_file(file: Path) -> Image.Image:
         CaptureError: it is damaged or too large, or needs a package that is not installed.
     """
     suffix = file.suffix.lower()
-    if suffix in _OPTIONAL:
+    if suffix in OPTIONAL_FORMATS:
         try:
             from pillow_heif import register_heif_opener
         except ImportError as error:
@@ -160,7 +151,7 @@ def open_picture_file(file: Path) -> Image.Image:
             ) from error
         register_heif_opener()
     # A file may be of another kind than its name says.
-    kinds = tuple(sorted({*_FORMATS.values(), (_FORMATS | _OPTIONAL)[suffix]}))
+    kinds = tuple(sorted({*PICTURE_FORMATS.values(), (PICTURE_FORMATS | OPTIONAL_FORMATS)[suffix]}))
     return picture_in(file, str(file), kinds, MAX_PIXELS)
 
 

@@ -11,14 +11,14 @@ poses are off by 2, 5 and 10 degrees; fitted clips of real hands) and on bad one
 import math
 import statistics
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from handavatar.capture.agreement import (
@@ -296,6 +296,21 @@ class _Cause:
     remedy: str
 
 
+@dataclass(frozen=True)
+class _Explanation:
+    """What could have happened to a frame.
+
+    Attributes:
+        reached: overlap of mask and mesh, were it undone.
+        of_mask: the cause, if the picture's edges follow the mesh.
+        of_both: the cause, if they follow the mask.
+    """
+
+    reached: float
+    of_mask: _Cause
+    of_both: _Cause
+
+
 _POSE_REMEDY = (
     "check pose and camera: the order of the joints (wrist, index, middle, little, ring, thumb), "
     "axis-angle in radians, metres, camera-to-world in OpenGL axes; a left hand is stored mirrored"
@@ -402,18 +417,21 @@ class _Comparison:
             cause = self._outside(number)
             if cause is not None:
                 return cause
-        explanations = [
-            explain(number)
-            for explain in (self._turned, self._exchanged, self._shifted, self._scaled)
-        ]
-        reached, cause = max(explanations, key=lambda each: each[0])
-        if reached > least:
-            return cause
+        explanations = (
+            self._turned(number),
+            self._exchanged(number),
+            self._shifted(number),
+            self._scaled(number),
+        )
+        best = max(explanations, key=lambda each: each.reached)
+        is_mask_wrong = self._follows_mesh(number)
+        if best.reached > least:
+            return best.of_mask if is_mask_wrong else best.of_both
         what = (
             f"the projected hand and the mask share {seen.overlap:.0%} of their area "
             f"(the median of the capture is {self._usual:.0%})"
         )
-        if self._follows_mesh(number):
+        if is_mask_wrong:
             return _Cause(
                 True,
                 f"{what}; the picture's edges follow the hand and not the mask",
@@ -489,70 +507,82 @@ class _Comparison:
             "OpenGL axes, metres) and the hand's translation (metres)",
         )
 
-    def _turned(self, number: int) -> tuple[float, _Cause | None]:
-        """The best overlap that turns of the mask reach, and what it would mean."""
-        seen, best, name = self._seen[number], 0.0, ""
+    def _turned_masks(self, number: int) -> Iterator[tuple[str, Bool[Tensor, "side side"]]]:
+        """The mask in every turn that keeps the picture's shape, and the turn's name."""
+        small = self._seen[number].small
         for turn, function in TURNS.items():
-            mask = turned(seen.small.mask, function, seen.small.height, seen.small.width)
-            if mask is not None and (found := float(overlap(mask, seen.small.mesh))) > best:
-                best, name = found, TURNED_BACK.get(turn, turn)
-        if self._follows_mesh(number):
-            return best, _Cause(
-                True, f"the mask is {name}, unlike picture and pose", "turn the mask back"
-            )
+            mask = turned(small.mask, function, small.height, small.width)
+            if mask is not None:
+                yield turn, mask
+
+    def _turned(self, number: int) -> _Explanation:
+        """The turn of the mask that lies best on the mesh."""
+        mesh = self._seen[number].small.mesh
+        found = [(float(overlap(mask, mesh)), turn) for turn, mask in self._turned_masks(number)]
+        best, turn = max(found, key=lambda each: each[0])
+        name = TURNED_BACK.get(turn, turn)
         remedy = "turn picture and mask back, or write pose and camera of the turned ones"
         if name == "mirrored left to right":
             remedy = "mirror both; a left hand is stored mirrored to a right one, with side: left"
-        what = f"picture and mask are {name} against pose and camera"
-        return best, _Cause(False, what, remedy)
+        return _Explanation(
+            best,
+            _Cause(True, f"the mask is {name}, unlike picture and pose", "turn the mask back"),
+            _Cause(False, f"picture and mask are {name} against pose and camera", remedy),
+        )
 
-    def _exchanged(self, number: int) -> tuple[float, _Cause | None]:
-        """As :meth:`_turned`, for the masks of other frames."""
+    def _exchanged(self, number: int) -> _Explanation:
+        """The mask of another frame that lies best on the mesh."""
         found = overlap(self._masks, self._meshes[number].expand_as(self._masks))
         other = int(found.argmax())
-        best, name = float(found[other]), self._name(other)
-        if self._follows_mesh(number):
-            return best, _Cause(
+        name = self._name(other)
+        return _Explanation(
+            float(found[other]),
+            _Cause(
                 True,
                 f"the mask belongs to another frame; that of {name} fits this one's hand",
                 "give every frame its own mask",
-            )
-        return best, _Cause(
-            False,
-            f"picture and mask belong to another pose; those of {name} fit this one's",
-            "give every frame its own pose and camera",
+            ),
+            _Cause(
+                False,
+                f"picture and mask belong to another pose; those of {name} fit this one's",
+                "give every frame its own pose and camera",
+            ),
         )
 
-    def _shifted(self, number: int) -> tuple[float, _Cause | None]:
-        """As :meth:`_turned`, for shifts."""
+    def _shifted(self, number: int) -> _Explanation:
+        """The shift of the mask that lies best on the mesh."""
         small = self._seen[number].small
         best, (right, down) = shifted_overlap(small.mesh, small.mask)
         place = _offset(right * small.scale, down * small.scale)
-        if self._follows_mesh(number):
-            return best, _Cause(
+        return _Explanation(
+            best,
+            _Cause(
                 True,
                 f"the mask lies {place} of picture and pose",
                 "make the mask in the picture's own pixels",
-            )
-        return best, _Cause(
-            False,
-            f"picture and mask lie {place} of where pose and camera put the hand",
-            "check cx and cy, which are pixels of this very picture, and the hand's translation",
+            ),
+            _Cause(
+                False,
+                f"picture and mask lie {place} of where pose and camera put the hand",
+                "check cx and cy, which are pixels of this very picture, and the hand's "
+                "translation",
+            ),
         )
 
-    def _scaled(self, number: int) -> tuple[float, _Cause | None]:
-        """As :meth:`_turned`, for other focal lengths."""
+    def _scaled(self, number: int) -> _Explanation:
+        """The focal length with which the mesh is as large as the mask."""
         seen = self._seen[number]
         factor = math.exp(seen.growth / 2)
         camera = seen.record.camera
         focal = (camera.focal[0] * factor, camera.focal[1] * factor)
         record = replace(seen.record, camera=replace(camera, focal=focal))
-        return self._overlap_of(number, record), _Cause(
+        cause = _Cause(
             False,
             f"the projected hand is {1 / factor:.2f} times as large as the mask",
             f"check fl_x and fl_y, found {camera.focal[0]:.0f} pixels (they change when pictures "
             "are scaled), and the hand's distance in metres",
         )
+        return _Explanation(self._overlap_of(number, record), cause, cause)
 
     def _overlap_of(self, number: int, record: FrameRecord) -> float:
         """Of the frame's mask with another pose or camera than its own."""
@@ -569,9 +599,8 @@ class _Comparison:
         edges = self._edges[number][None]
         is_faint = own < _FAINT * self._usual_best
         found: list[tuple[float, Tensor, str, str]] = []
-        for turn, function in TURNS.items():
-            mask = turned(small.mask, function, small.height, small.width)
-            if mask is not None and float(overlap(mask, small.mask)) < _SAME_MASK:
+        for turn, mask in self._turned_masks(number):
+            if float(overlap(mask, small.mask)) < _SAME_MASK:
                 score = float(edge_scores(edges, mask[None]))
                 found.append((score, mask, f"is {turn} against its mask", "turn its pixels back"))
         best, shift = self._shifts[number]
@@ -587,11 +616,9 @@ class _Comparison:
             remedy = "give every frame its own picture"
             found.append((float(self._scores[number, other]), self._masks[other], what, remedy))
         # Backgrounds have edges too; what lies within them has not the colours of this hand.
-        contrast = self._skin.contrast(small, small.mask)
-        for score, mask, what, remedy in sorted(found, key=lambda each: -each[0]):
-            if score <= _TELLING * max(own, 1.0):
-                break
-            if self._skin.contrast(small, mask) > contrast:
+        telling = [each for each in found if each[0] > _TELLING * max(own, 1.0)]
+        for _, mask, what, remedy in sorted(telling, key=lambda each: -each[0]):
+            if self._skin.contrast(small, mask) > self._skin.contrast(small, small.mask):
                 return _Cause(False, f"the picture {what}", remedy)
         if own < _NOTHING * self._usual_own or self._usual_own < _CHANCE:
             return _Cause(

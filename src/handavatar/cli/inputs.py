@@ -13,6 +13,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from handavatar.capture.checks import OPTIONAL_FORMATS, PICTURE_FORMATS, is_pattern
+
 _HEAD = 64 * 1024
 """Bytes of a file that are looked at; of a safetensors file, its header."""
 _MOST_HEADER = 16 * 2**20
@@ -20,7 +22,7 @@ _MOST_ENTRIES = 2000
 """Entries of a folder that are looked at, with those below it."""
 _RUN_DEPTH = 4
 """``outputs/{capture}/{method}/{time}``: where runs lie below what a user may name."""
-_PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".ppm", ".heic", ".heif")
+_PICTURES = tuple(PICTURE_FORMATS | OPTIONAL_FORMATS)
 _VIDEOS = (
     *(".mp4", ".mov", ".mkv", ".webm", ".avi", ".ts", ".mts", ".gif", ".m4v", ".wmv", ".flv"),
     *(".mpg", ".mpeg", ".3gp", ".ogv", ".mxf"),
@@ -284,7 +286,7 @@ def _kind(path: Path) -> str:
 
 
 def _is_pattern(path: Path) -> bool:
-    is_one = any(sign in path.name for sign in "*?[%") and path.parent.is_dir()
+    is_one = is_pattern(path.name) and path.parent.is_dir()
     return is_one and path.suffix.lower() not in _VIDEOS
 
 

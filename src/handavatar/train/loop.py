@@ -292,11 +292,6 @@ def train(options: TrainOptions) -> Path:
     if steps < 1:
         raise ValueError(f"--steps {steps}: expected at least 1")
     capture = read_capture(options.capture)
-    indices = capture.split("train")
-    if not indices:
-        raise CaptureError(
-            f"{capture.folder}: no frame of split 'train'", "mark some frames as split: train"
-        )
     require_sound(capture)
     frames = training_frames(capture, method)
     perceptual = perceptual_loss(options.perceptual).to(device)
