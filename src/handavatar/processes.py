@@ -8,11 +8,15 @@ from dataclasses import dataclass
 import torch
 import torch.distributed
 
+from handavatar.errors import ErrorKind, HandAvatarError
+
 _OF_TORCHRUN = ("RANK", "MASTER_ADDR", "MASTER_PORT")
 
 
-class ProcessesError(ValueError):
+class ProcessesError(HandAvatarError):
     """An environment that speaks of several processes, but does not say where they are."""
+
+    kind = ErrorKind.USAGE
 
 
 @dataclass(frozen=True)

@@ -366,7 +366,7 @@ def test_a_part_is_taken_and_what_is_not_looked_at_is_said(tmp_path: Path) -> No
     notes.clear()
     list(video_frames(path, Sampling(10.0), notes.append))
     assert notes == []
-    with pytest.raises(CaptureError, match=r"--start 7 lies behind its end at 2\.0 seconds"):
+    with pytest.raises(CaptureError, match=r"`start=7` lies behind its end at 2\.0 seconds"):
         list(video_frames(path, Sampling(10.0, start=7.0)))
 
 

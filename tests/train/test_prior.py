@@ -136,18 +136,18 @@ def test_a_prior_that_diverges_says_how_to_go_on(
         monkeypatch.setattr(torch.optim.Adam, "step", step)
 
     diverging(1, False)
-    with pytest.raises(NotFinite, match=r"step 1: .* holds inf(.|\n)*again with --seed 1$"):
+    with pytest.raises(NotFinite, match=r"step 1: .* holds inf(.|\n)*again with `seed=1`$"):
         train_prior(options)
     assert not (tmp_path / "a").exists()
     # In the last step, and in the optimiser alone.
     diverging(4, True)
     with pytest.raises(NotFinite, match=r"step 4: adam\.\d+\.exp_avg_sq holds inf") as caught:
         train_prior(options)
-    assert f"--start-from {tmp_path / 'a'} --seed 1" in str(caught.value)
+    assert f"`start_from='{tmp_path / 'a'}'` `seed=1`" in str(caught.value)
     diverging(3, False)
     with pytest.raises(NotFinite, match=r"step 3(.|\n)*checkpoint of step 2 is good") as caught:
         train_prior(with_folder)
-    assert f"--folder {tmp_path / 'run'} --seed 1" in str(caught.value)
+    assert f"`folder='{tmp_path / 'run'}'` `seed=1`" in str(caught.value)
     monkeypatch.setattr(torch.optim.Adam, "step", advance)
     for again in (
         replace(options, start_from=tmp_path / "a", seed=1),

@@ -117,7 +117,7 @@ def test_a_stopped_training_continues_bit_for_bit(
 
     with monkeypatch.context() as patched:
         patched.setattr(PoseStream, "drawn", interrupted)
-        with pytest.raises(Interrupted, match="stopped at step 3; continue with --folder"):
+        with pytest.raises(Interrupted, match="stopped at step 3; continue with `folder="):
             train_prior(options)
     # As if it had been killed later, after a checkpoint that the disk lost.
     (tmp_path / "run" / "log.jsonl").open("a").write(json.dumps({"step": 4}) + "\n")

@@ -4,6 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from handavatar.errors import ArgumentError
+
 if TYPE_CHECKING:
     from handavatar.train.loop import TrainOptions
 
@@ -27,7 +29,7 @@ def train(words: list[str]) -> int:
         return _train_in_view(options, run_folder(options), extras)
     for extra in page:
         if extras[extra.name] != extra.default:
-            raise ValueError(f"--{extra.name}: only with --view")
+            raise ArgumentError(extra.name, "only with `view=True`")
     _say_trained(train_avatar(options))
     return 0
 

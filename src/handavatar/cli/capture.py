@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from handavatar.cli.failures import BAD_DATA, printable
+from handavatar.cli.failures import BAD_DATA, shown
+from handavatar.errors import ArgumentError
 
 if TYPE_CHECKING:
     from handavatar.capture.video import VideoOptions
@@ -85,7 +86,7 @@ def _record(options: "VideoOptions", values: dict[str, Any]) -> Path | None:
 
     out, drive = values["out"], values["drive"]
     if out is None and drive is None:
-        raise ValueError("--out: say where the capture is to be, or --drive an avatar")
+        raise ArgumentError("out", "say where the capture is to be, or `drive` an avatar")
     sampling = options.sampling()
     longest = sampling.wanted(sampling.max_frames)
     if sampling.end is not None:
@@ -109,10 +110,10 @@ def _capture_hand(options: "VideoOptions") -> None:
         )
     skipped = json.loads((options.out / "skipped.json").read_text(encoding="utf-8"))
     for name, reason in skipped["frames"].items():
-        print(f"skipped {name}: {reason}")
+        print(shown(f"skipped {name}: {reason}"))
     fit = json.loads((options.out / "fit.json").read_text(encoding="utf-8"))
     for line in summary_lines(fit["summary"]):
-        print(line)
+        print(shown(line))
     print(f"look at: {options.out / 'overview.png'}")
     print(f"capture: {options.out}\nnext: handavatar train {options.out}")
 
@@ -194,6 +195,6 @@ def check(words: list[str]) -> int:
         print_json({"sound": not problems, "problems": [vars(problem) for problem in problems]})
     else:
         for problem in problems:
-            print(printable(str(problem)))
+            print(shown(str(problem)))
         print(f"{options.capture}: {f'{len(problems)} problems' if problems else 'sound'}")
     return BAD_DATA if problems else 0

@@ -130,7 +130,7 @@ def evaluate_run(
     if not indices:
         raise CaptureError(
             f"{capture.folder}: no frame of split {options.split!r}",
-            "name another split with --split",
+            "name another split with `split`",
         )
     clips = {capture.records[index].clip for index in indices}
     if max(clips) >= avatar.num_lights:
@@ -226,7 +226,7 @@ def _opened(options: EvaluateOptions) -> tuple[HandAvatar, Capture, Path]:
     else:
         folder = options.capture
         if folder is None:
-            raise CaptureError(f"{run}: a file alone names no capture", "name one with --capture")
+            raise CaptureError(f"{run}: a file alone names no capture", "name one with `capture`")
         avatar = HandAvatar.load(run)
         out = options.out or run.parent / f"{run.stem}-evaluation"
     return avatar, read_capture(folder), out
@@ -268,7 +268,7 @@ def _measured(
     if frames[0].camera.width != stored:
         notes.append(
             f"judged at {frames[0].camera.width} pixels along a side, of {stored} that the capture "
-            "stores; --full-size judges these"
+            "stores; `full_size` judges these"
         )
     times = torch.tensor([frame.time for frame in frames], dtype=torch.float64)
     figures = {

@@ -33,6 +33,7 @@ from handavatar.avatar import (
     RenderSettings,
     chosen_device,
 )
+from handavatar.errors import require_ranges
 from handavatar.evaluate.published_coap import published_coap_query
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.geometry.cameras import (
@@ -134,12 +135,7 @@ def speed_table(
         CheckpointError: if the avatar cannot be read.
         ValueError: if there are fewer rays or poses than can be chosen.
     """
-    if not 1 <= options.poses <= len(GESTURES):
-        raise ValueError(f"--poses: found {options.poses}, expected 1 to {len(GESTURES)}")
-    if not 1 <= options.plain_rays <= options.size**2:
-        raise ValueError(
-            f"--plain-rays: found {options.plain_rays}, expected 1 to {options.size**2}"
-        )
+    require_ranges(options, poses=(1, len(GESTURES)), plain_rays=(1, options.size**2))
     device = chosen_device(options.device)
     ways = _ways(device)
     avatar = HandAvatar.load(options.avatar).moved_to(device)

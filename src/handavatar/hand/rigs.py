@@ -46,7 +46,7 @@ def save_rig(model: ManoModel, path: Path | None = None, overwrite: bool = False
         path = rigs_folder() / f"{rig.name}-{rig.sha256[:12]}.safetensors"
         overwrite = True  # Its name says that it holds the same.
     if path.exists() and not (overwrite and path.is_file()):
-        raise RigError(f"{path}: exists already\nname another file, or add --overwrite")
+        raise RigError(f"{path}: exists already\nname another file, or add `overwrite=True`")
     tensors = {name: getattr(rig, name).contiguous() for name in _TENSORS}
     tensors |= {_SET_PREFIX + name: members for name, members in rig.vertex_sets.items()}
     tensors |= {"hands_mean": model.hands_mean, "hands_components": model.hands_components}
@@ -121,7 +121,7 @@ def load_rig(reference: str, level: Level = "full") -> Rig:
     if level != "full":
         raise RigError(
             f"rig {reference[:80]}: found level {level}, which the open hand alone has\n"
-            "leave out --level: other rigs are used as they are"
+            "leave out `level`: other rigs are used as they are"
         )
     path = Path(reference)
     if path.suffix == ".pkl":

@@ -32,7 +32,7 @@ from handavatar.jobs.finite import require_finite
 
 SHARPNESS = 100.0
 """The paper's eta: a weight of 0.01 counts as 63 % of a bone."""
-_BEGIN_ANEW = "begin anew with another --seed or a lower --lr, and without --resume"
+_BEGIN_ANEW = "begin anew with another `seed` or a lower `lr`, and without `resume=True`"
 # Decay of the running means of the gradient and of its square.
 _MOMENTUM, _SCALE = 0.9, 0.99
 

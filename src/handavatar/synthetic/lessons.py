@@ -102,7 +102,7 @@ def train_made_tracker(
     state_file = options.out.with_suffix(".state")
     if options.resume and not state_file.is_file():
         raise CaptureError(
-            f"{state_file}: there is nothing to go on with", "train without --resume"
+            f"{state_file}: there is nothing to go on with", "train without `resume=True`"
         )
     rig = load_rig(RIG)
     points = TrackedPoints.of(rig, NUM_SKIN_POINTS)
@@ -123,7 +123,7 @@ def train_made_tracker(
             training.restore(state)
         except (OSError, SafetensorError, KeyError, RuntimeError, NotFinite) as error:
             raise CaptureError(
-                f"{state_file} cannot be gone on with ({error})", "train without --resume"
+                f"{state_file} cannot be gone on with ({error})", "train without `resume=True`"
             ) from error
     lessons = draw_lessons(read_pictures(files), training)
     saved, written = time.monotonic(), training.step
@@ -151,11 +151,11 @@ def train_made_tracker(
 def _way_from(options: TrackerTrainOptions, written: int) -> str:
     """What to do after a step that was not finite; the step of the state that was written."""
     again = "give the same command again with"
-    rate = f"--rate {options.rate / 2:g}"
+    rate = f"`rate={options.rate / 2:g}`"
     if not written:
         return f"{again} {rate}"
     state_file = options.out.with_suffix(".state")
-    return f"{state_file} holds step {written}, which is good\n{again} --resume {rate}"
+    return f"{state_file} holds step {written}, which is good\n{again} `resume=True` {rate}"
 
 
 def evaluate_made_tracker(options: TrackerEvaluateOptions) -> TrackerFigures:

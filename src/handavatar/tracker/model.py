@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save
 
+from handavatar.errors import HandAvatarError
 from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import find_not_finite, require_finite
 from handavatar.jobs.threads import one_thread
@@ -22,7 +23,7 @@ SCHEMA = 1
 _ASSET = "tracker.safetensors"
 
 
-class TrackerError(ValueError):
+class TrackerError(HandAvatarError):
     """A file that is no trained tracker."""
 
 

@@ -10,6 +10,7 @@ import torch
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.frames import read_capture
+from handavatar.errors import ArgumentError
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable, step_counter
 from handavatar.jobs.files import make_folder
@@ -58,7 +59,7 @@ class AblationTableOptions:
         """
         for word in self.rows:
             if not any(word in name for name in ROWS):
-                raise ValueError(f"--rows {word}: no row is called so; there are {'; '.join(ROWS)}")
+                raise ArgumentError("rows", f"no row is called {word}; there are {'; '.join(ROWS)}")
         words = self.rows or ("",)
         return tuple(name for name in ROWS if any(word in name for word in words))
 

@@ -103,7 +103,7 @@ def divergence_noted(run: Run, begun: int, seed: int, words: str) -> Iterator[No
         raise NotFinite(
             error.found,
             f"{state} with another seed\ngive the same command again with {words} "
-            f"--seed {_unused_seed([*earlier, last], seed)}",
+            f"`seed={_unused_seed([*earlier, last], seed)}`",
         ) from error
 
 

@@ -16,6 +16,7 @@ from handavatar.capture.frames import FITTED_SIDE, Capture, CaptureError, Frame,
 from handavatar.capture.soundness import require_sound
 from handavatar.capture.view import view_of
 from handavatar.edit import Edit
+from handavatar.errors import ArgumentError, argument
 from handavatar.evaluate.metrics import mean_color
 from handavatar.evaluate.perceptual import PerceptualChoice, PerceptualLoss, perceptual_loss
 from handavatar.field.shading import CueSet, OrientedCues, PaperCues, TracedCues
@@ -290,7 +291,7 @@ def train(options: TrainOptions) -> Path:
     method = METHODS[options.method]
     steps = method.steps if options.steps is None else options.steps
     if steps < 1:
-        raise ValueError(f"--steps {steps}: expected at least 1")
+        raise ArgumentError("steps", str(steps), "at least 1")
     capture = read_capture(options.capture)
     require_sound(capture)
     frames = training_frames(capture, method)
@@ -303,7 +304,7 @@ def train(options: TrainOptions) -> Path:
     run = _open_or_create(options, capture, perceptual.name, steps)
     live = shown_live(run, training.avatar, training.corrections, frames)
     begun = run.facts["seed"]
-    words = f"--out {run.folder} --resume auto"
+    words = f"{argument('out', run.folder)} `resume='auto'`"
     noted = divergence_noted(run, begun, options.seed, words)
     with locked(run), stop_signals() as stopped, live, _repeatable(device), noted:
         checkpoint = latest_checkpoint(run)
@@ -331,7 +332,7 @@ def train(options: TrainOptions) -> Path:
                 if is_last or stopped() or step % options.checkpoint_every == 0:
                     _save(run, training, outlines, step)
                 if stopped() and not is_last:
-                    raise Interrupted(f"stopped at step {step}; continue with --resume auto")
+                    raise Interrupted(f"stopped at step {step}; continue with `resume='auto'`")
         with finite_stage("detail", lambda: model_tensors(training)):
             _learn_detail(
                 training, capture, frames, seen, perceptual, method, options.seed, stopped
@@ -405,7 +406,7 @@ def _learn_detail(
 
     def end_if_stopped() -> None:
         if stopped():
-            raise Interrupted("stopped while the detail is learned; continue with --resume auto")
+            raise Interrupted("stopped while the detail is learned; continue with `resume='auto'`")
 
     learned = learn_detail(
         avatar,
@@ -894,7 +895,7 @@ def _require_same_training(run: Run, options: TrainOptions, capture: Capture) ->
     if run.options.get("avatar_schema") != SCHEMA:
         raise CheckpointError(
             f"{run.folder}: was begun by a version whose weights mean something else\n"
-            "name another folder with --out, or begin anew with --resume never"
+            "name another folder with `out`, or begin anew with `resume='never'`"
         )
     facts = run.facts
     seed = read_seeds(run, facts["seed"])[-1].seed
@@ -906,7 +907,7 @@ def _require_same_training(run: Run, options: TrainOptions, capture: Capture) ->
         if old != new:
             raise CheckpointError(
                 f"{run.folder}: was begun with {what} {str(old)[:12]}, now it is {str(new)[:12]}\n"
-                "name another folder with --out, or begin anew with --resume never"
+                "name another folder with `out`, or begin anew with `resume='never'`"
             )
 
 

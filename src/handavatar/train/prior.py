@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from handavatar.avatar import CheckpointError
+from handavatar.errors import ArgumentError, argument
 from handavatar.evaluate.metrics import mask_iou
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
 from handavatar.hand.open_hand import Level
@@ -139,23 +140,25 @@ def train_prior(
             joints with another decoder.
     """
     if options.joint_points and options.decoder != "pair":
-        raise ValueError(
-            f"prior: found {options.joint_points} points at joints for the decoder "
-            f"{options.decoder!r}; only 'pair' answers for two parts at once"
+        raise ArgumentError(
+            "joint_points",
+            f"{options.joint_points} for the decoder {options.decoder!r}",
+            "0: only 'pair' answers for two parts at once",
         )
     base = load_rig(options.rig, options.level)
     with joined_processes(options.device) as processes, stop_signals() as stopped:
         if options.poses % processes.count:
-            raise ValueError(
-                f"prior: found {options.poses} poses a step for {processes.count} processes, "
-                "expected as many for each; give a multiple with --poses"
+            raise ArgumentError(
+                "poses",
+                f"{options.poses} a step for {processes.count} processes",
+                "as many for each: a multiple",
             )
         with ExitStack() as held:
             run = None
             if options.folder is not None and processes.is_first:
                 run = begin_prior_run(options.folder, _what_to_learn(options, base))
                 held.enter_context(locked(run))
-                begun, words = run.options["seed"], f"--folder {options.folder}"
+                begun, words = run.options["seed"], argument("folder", options.folder)
                 held.enter_context(divergence_noted(run, begun, options.seed, words))
             return _trained(options, base, processes, run, stopped, report)
 
@@ -239,7 +242,7 @@ def _trained(
                 save_progress(run, step, field, optimizers, average)
         if is_stopped and step < options.steps:
             way = (
-                f"continue with --folder {options.folder}"
+                f"continue with {argument('folder', options.folder)}"
                 if options.folder
                 else f"so far: {options.out}"
             )
@@ -251,10 +254,10 @@ def _way_from(options: PriorOptions, written: int) -> str:
     """What to do where there is no folder to go on in; the step of the file that was written."""
     again = "give the same command again with"
     if not written:
-        return f"{again} --seed {options.seed + 1}"
+        return f"{again} `seed={options.seed + 1}`"
     return (
         f"{options.out} holds the weights of step {written}, which are good\n"
-        f"{again} --start-from {options.out} --seed {options.seed + 1}"
+        f"{again} {argument('start_from', options.out)} `seed={options.seed + 1}`"
     )
 
 
@@ -311,7 +314,7 @@ def load_prior(
     if found != decoder:
         raise CheckpointError(
             f"{path} holds a prior with the decoder {found!r}, expected {decoder!r}: train one "
-            f"with `handavatar prior train --decoder {decoder}`"
+            f"with handavatar prior train {argument('decoder', decoder)}"
         )
     try:
         tensors = load_file(path)
@@ -341,7 +344,8 @@ def _decoder_of(path: Path) -> Decoder:
     """Which decoder a file's weights are of; the first files did not say and hold PairOF."""
     if not path.is_file():
         raise CheckpointError(
-            f"no occupancy prior at {path}: train one with `handavatar prior train --out {path}`"
+            f"no occupancy prior at {path}: train one with handavatar prior train "
+            f"{argument('out', path)}"
         )
     try:
         with safe_open(path, framework="pt") as file:

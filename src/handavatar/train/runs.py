@@ -232,7 +232,7 @@ def create_run(
     except FolderInUse as error:
         raise CheckpointError(
             f"{error.found}, expected a new folder\n"
-            "name another with --out, or continue the run that is there with --resume auto"
+            "name another with `out`, or continue the run that is there with `resume='auto'`"
         ) from error
     return Run(folder)
 
@@ -302,7 +302,7 @@ def locked(run: Run) -> Iterator[None]:
             holder = file.read(200).strip() or "another process"
             raise CheckpointError(
                 f"{run.folder}: {holder} is writing this run\n"
-                "wait until it has ended or stop it, or train into another folder with --out"
+                "wait until it has ended or stop it, or train into another folder with `out`"
             ) from error
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}")
@@ -507,7 +507,7 @@ def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
 def _broken(path: Path, what: str) -> CheckpointError:
     return CheckpointError(
         f"{path}: {what}\n"
-        "continue from the newest whole checkpoint with --resume auto, or train again"
+        "continue from the newest whole checkpoint with `resume='auto'`, or train again"
     )
 
 

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from handavatar.avatar import EXACT, HandAvatar, HandState, RayValues, RenderSettings
+from handavatar.errors import require_ranges
 from handavatar.evaluate.speed_table import hand_camera
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.field.occupancy import BOX_MARGIN, PairOccupancy, hand_codes
@@ -86,13 +87,9 @@ def training_table(
 
     Raises:
         CheckpointError: if the avatar cannot be read.
-        ValueError: if the patch does not fit, or has fewer rays than the plain way shall take.
+        ArgumentError: if the patch does not fit, or has fewer rays than the plain way shall take.
     """
-    if not 1 <= options.patch <= _PICTURE or not 1 <= options.plain_rays <= options.patch**2:
-        raise ValueError(
-            f"training table: found a patch of {options.patch} pixels and {options.plain_rays} "
-            f"plain rays, expected 1 to {_PICTURE} pixels and at most as many rays as it has"
-        )
+    require_ranges(options, patch=(1, _PICTURE), plain_rays=(1, options.patch**2))
     finished = step_counter(report)
     rows = _patch_rows(options, finished)
     plain, ours = _step_seconds(options, finished)

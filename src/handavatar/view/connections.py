@@ -15,6 +15,7 @@ from importlib import resources
 from typing import Any, Protocol
 from urllib.parse import parse_qs, urlsplit
 
+from handavatar.errors import ArgumentError, argument
 from handavatar.view.guard import POSTED_KINDS, Guard, Refused
 from handavatar.view.scene import SceneError
 from handavatar.view.studio import MOST_PICTURE_BYTES, Interrupted
@@ -264,6 +265,9 @@ def bound(host: str, port: int) -> HttpServer:
             return kind((host, candidate))
         except OSError as error:
             if error.errno != errno.EADDRINUSE or candidate == last:
-                where = f"--host {host} --port {candidate}"
-                raise OSError(error.errno, f"{error.strerror}: choose another", where) from error
+                where = f"{argument('host', host)} {argument('port', candidate)}"
+                name = "port" if error.errno in (errno.EADDRINUSE, errno.EACCES) else "host"
+                raise ArgumentError(
+                    name, f"{where}: {error.strerror}", "", f"choose another `{name}`"
+                ) from error
     raise AssertionError("the last port returns or raises")

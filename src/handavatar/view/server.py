@@ -21,6 +21,7 @@ import torch
 
 from handavatar.avatar import HandAvatar, RenderSettings, chosen_device
 from handavatar.capture.motion import MOTIONS, Motion, read_motion
+from handavatar.errors import require_range
 from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.train.live import read_live
 from handavatar.train.runs import Run
@@ -236,8 +237,7 @@ def checked_guard(host: str, port: int, token: str) -> Guard:
     Raises:
         ValueError: for a port or token that cannot be.
     """
-    if not 0 <= port < 65536:
-        raise ValueError(f"--port {port}: expected 0 to 65535")
+    require_range("port", port, 0, 65535)
     return guard_of(host, token)
 
 
