@@ -23,7 +23,7 @@ from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chos
 from handavatar.capture.motion import gesture, open_motion
 from handavatar.capture.view import camera_holding, start_of
 from handavatar.edit import Edit
-from handavatar.errors import ArgumentError
+from handavatar.errors import ArgumentError, require_ranges
 from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.colors import eight_bits
@@ -86,6 +86,13 @@ class RenderOptions(Look):
     overwrite: bool = False
     device: str = "auto"
     kernel: Kernel = "auto"
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        super().__post_init__()
+        require_ranges(
+            self, size=(2, 8192), frames=(1, 10**5), num_samples=(1, 4096), check=(0, 10**6)
+        )
 
 
 def render_motion(options: RenderOptions) -> Path:

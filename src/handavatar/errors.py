@@ -126,7 +126,11 @@ def argument(name: str, value: object = None) -> str:
     return f"`{name}`" if value is None else f"`{name}={shown!r}`"
 
 
-def require_ranges(options: object, **ranges: tuple[float, float]) -> None:
+SEEDS = (0, 2**32 - 1)
+"""What all generators here take as a seed."""
+
+
+def require_ranges(options: object, **ranges: tuple[int | float, int | float]) -> None:
     """Refuses options out of range; NaN is out of every range.
 
     Args:
@@ -141,7 +145,7 @@ def require_ranges(options: object, **ranges: tuple[float, float]) -> None:
         require_range(name, value, least, most)
 
 
-def require_range(name: str, value: object, least: float, most: float) -> None:
+def require_range(name: str, value: object, least: int | float, most: int | float) -> None:
     """Refuses one argument out of range, as :func:`require_ranges`.
 
     Args:
@@ -160,7 +164,7 @@ def require_range(name: str, value: object, least: float, most: float) -> None:
             raise ArgumentError(name, str(number)[:40], f"{_plain(least)} to {_plain(most)}")
 
 
-def _plain(number: float) -> str:
+def _plain(number: int | float) -> str:
     """A bound without an exponent, where it is a whole number."""
     return str(int(number)) if float(number).is_integer() else f"{number:g}"
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from handavatar.avatar import HandAvatar
 from handavatar.capture.checks import CaptureError, decoded, open_picture
 from handavatar.edit import Edit, Paint, bones_named
-from handavatar.errors import ArgumentError, HandAvatarError, require_range
+from handavatar.errors import ArgumentError, HandAvatarError, require_range, require_ranges
 from handavatar.hand.rig import Rig
 
 _UNSEEN_COLOR = (0.85, 0.1, 0.75)
@@ -36,6 +36,10 @@ class Look:
     lift_shadow: str = ""
     paint: Path | None = None
     light: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, light_gain=(0, 1000), light=(0, 10**6))
 
     def check_look(self) -> None:
         """Refuses words that mean nothing, before anything is read.

@@ -19,6 +19,7 @@ from handavatar.capture.motion_files.trackers import is_hawor
 from handavatar.capture.motion_values import MAX_STEPS
 from handavatar.capture.tracking import has_mediapipe
 from handavatar.capture.video import VideoOptions, capture_video
+from handavatar.errors import require_ranges
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.rigs import load_rig
 
@@ -58,6 +59,10 @@ class MotionFromOptions:
     """Of a file's camera; opengl has y up and z backwards."""
     focal: float | None = None
     """True focal length in pixels of the pictures that HaMeR or WiLoR saw, for their depths."""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, fps=(0.001, 1000), focal=(1, 1e6))
 
 
 def motion_from(

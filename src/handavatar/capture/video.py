@@ -49,7 +49,7 @@ from handavatar.capture.video_report import (
     too_few,
     with_common_gain,
 )
-from handavatar.errors import ArgumentError
+from handavatar.errors import ArgumentError, require_ranges
 from handavatar.fit.energy import VIDEO_TEXTURE_SHARE, EnergyOptions
 from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.rotations import mirror_rigid
@@ -121,6 +121,10 @@ class VideoOptions:
         )
     )
     """How the hand is laid onto masks and texture."""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, camera_unit=(1e-6, 1e6), size=(16, 4096), min_confidence=(0, 1))
 
     def sampling(self) -> Sampling:
         """Which pictures of the video are taken.

@@ -11,6 +11,7 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from handavatar.cli.inputs import Expected, require
+from handavatar.errors import require_range
 
 Options = TypeVar("Options")
 
@@ -25,6 +26,8 @@ class Extra:
         help: one line.
         default: value if it is not given; ``...`` means that it is required.
         is_positional: stands without a name, before the others.
+        least: of a number; not looked at where it is above ``most``.
+        most: of a number.
     """
 
     name: str
@@ -32,6 +35,8 @@ class Extra:
     help: str
     default: Any = ...
     is_positional: bool = False
+    least: float = 1
+    most: float = 0
 
 
 JSON = Extra("json", bool, "print one JSON object and nothing else", False)
@@ -85,6 +90,7 @@ def parse_with(
 
     Raises:
         WrongInput: a path is of another kind.
+        ArgumentError: a number is out of range.
 
     Tyro reads a subclass of the dataclass that carries the command line's own conventions, so
     that the code it serves need not know them.
@@ -111,12 +117,21 @@ def parse_with(
         defaults: Any = {"default": field.default, "default_factory": field.default_factory}
         fields.append((field.name, kind, dataclasses.field(**defaults)))
     twin = dataclasses.make_dataclass(
-        options.__name__, fields, bases=(options,), kw_only=True, frozen=True
+        options.__name__,
+        fields,
+        bases=(options,),
+        # What is out of range the dataclass itself says, outside of tyro.
+        namespace={"__post_init__": lambda self: None},
+        kw_only=True,
+        frozen=True,
     )
     twin.__doc__ = about or options.__doc__
     parsed: Any = tyro.cli(
         twin, args=words, prog=f"handavatar {command}", config=(tyro.conf.FlagCreatePairsOff,)
     )
+    for extra in extras:
+        if extra.least <= extra.most:
+            require_range(extra.name, getattr(parsed, extra.name), extra.least, extra.most)
     found = {field.name: getattr(parsed, field.name) for field in own}
     found |= {name: value for name, value in values.items() if found[name] is None}
     for name, expected in (reads or {}).items():

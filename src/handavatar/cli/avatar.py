@@ -19,7 +19,9 @@ def train(words: list[str]) -> int:
 
     page = (
         Extra("view", bool, "a page shows the training, and afterwards the avatar", False),
-        Extra("port", int, "of the page; if it is taken, the next free one", 7007),
+        Extra(
+            "port", int, "of the page; if it is taken, the next free one", 7007, least=0, most=65535
+        ),
         Extra("host", str, "where the page listens, as for view", "127.0.0.1"),
         Extra("token", str, "who does not know it does not see the page, as for view", ""),
     )

@@ -53,7 +53,9 @@ def webcam(words: list[str]) -> int:
             "run folder or file of an avatar, which follows the hand beside the camera's picture",
             None,
         ),
-        Extra("port", int, "of the page; if it is taken, the next free one", 7007),
+        Extra(
+            "port", int, "of the page; if it is taken, the next free one", 7007, least=0, most=65535
+        ),
         Extra("host", str, "where the page listens, as for view", "127.0.0.1"),
         Extra("token", str, "who does not know it does not see the page, as for view", ""),
     )

@@ -25,6 +25,7 @@ from handavatar.capture.frames import (
 from handavatar.capture.registration import poses_of as registered_poses
 from handavatar.capture.registration import register_frames
 from handavatar.edit import Edit
+from handavatar.errors import require_ranges
 from handavatar.evaluate.baselines import judged_frame, textured_mesh_psnr, training_color
 from handavatar.evaluate.figures import protocol_figures
 from handavatar.evaluate.metrics import (
@@ -87,6 +88,10 @@ class EvaluateOptions:
     max_frames: int | None = None
     full_size: bool = False
     device: str = "auto"
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, max_frames=(1, 10**6))
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,7 @@ from handavatar.avatar import HandAvatar
 from handavatar.capture.motion import Motion, gesture, open_motion
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
-from handavatar.errors import ArgumentError
+from handavatar.errors import ArgumentError, require_ranges
 from handavatar.export.baking import baked_textures, colors_at_vertices
 from handavatar.export.gltf import glb_bytes
 from handavatar.export.lightweight import Tell, lightweight_hand
@@ -65,6 +65,11 @@ class ExportOptions(Look):
     pose: str = "flat"
     unlit: bool = False
     overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        super().__post_init__()
+        require_ranges(self, texture_size=(16, MAX_TEXTURE))
 
 
 def export_avatar(options: ExportOptions, tell: Tell = lambda job, step, total: None) -> Path:

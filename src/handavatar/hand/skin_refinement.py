@@ -16,6 +16,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.geometry.closest import closest_on_mesh
 from handavatar.geometry.meshes import uniform_laplacian_matrix, unique_edges
 from handavatar.geometry.rotations import (
@@ -76,6 +77,22 @@ class RefinementOptions:
     final_lr: float = 1e-5
     is_local: bool = True
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            steps=(0, 10**7),
+            refit_steps=(0, 10**7),
+            poses=(1, 1000),
+            surface_points=(1, 10**6),
+            smoothness=(0, 1e6),
+            surface=(0, 1e6),
+            sparsity=(0, 1e6),
+            lr=(1e-12, 1),
+            final_lr=(1e-12, 1),
+            seed=SEEDS,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from handavatar.capture.checks import CaptureError
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
@@ -76,6 +77,17 @@ class TrackerTrainOptions:
     resume: bool = False
     """go on where a training of this file ended, or was ended"""
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            count=(1, 10**8),
+            steps=(1, 10**8),
+            seed=SEEDS,
+            processes=(0, 1024),
+            rate=(1e-12, 1),
+        )
+
 
 @dataclass(frozen=True)
 class TrackerEvaluateOptions:
@@ -85,6 +97,10 @@ class TrackerEvaluateOptions:
     """file; the one that ships if None"""
     count: int = 2000
     """made pictures that none was taught with"""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, count=(1, 10**7))
 
 
 def train_made_tracker(

@@ -10,7 +10,7 @@ import torch
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.frames import read_capture
-from handavatar.errors import ArgumentError
+from handavatar.errors import SEEDS, ArgumentError, require_ranges
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable, step_counter
 from handavatar.jobs.files import make_folder
@@ -49,6 +49,10 @@ class AblationTableOptions:
     seeds: tuple[int, ...] = (0, 1, 2)
     steps: int = 310
     any_commit: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, seeds=SEEDS, steps=(1, 10**8))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from handavatar.errors import ArgumentError
+from handavatar.errors import SEEDS, ArgumentError, require_ranges
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
@@ -87,6 +87,20 @@ class ComparisonOptions:
     level: Level = "full"
     rounds: int = POINT_ROUNDS
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            guides=(0, 4),
+            seeds=SEEDS,
+            steps=(1, 10**8),
+            points=(1, 10**6),
+            poses=(2, 10**5),
+            judged_points=(2, 10**6),
+            measured_poses=(2, 10**5),
+            rounds=(0, 4),
+        )
 
 
 GUIDED: Decoder = "coap"

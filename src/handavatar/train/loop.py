@@ -16,7 +16,7 @@ from handavatar.capture.frames import FITTED_SIDE, Capture, CaptureError, Frame,
 from handavatar.capture.soundness import require_sound
 from handavatar.capture.view import view_of
 from handavatar.edit import Edit
-from handavatar.errors import ArgumentError, argument
+from handavatar.errors import SEEDS, argument, require_ranges
 from handavatar.evaluate.metrics import mean_color
 from handavatar.evaluate.perceptual import PerceptualChoice, PerceptualLoss, perceptual_loss
 from handavatar.field.shading import CueSet, OrientedCues, PaperCues, TracedCues
@@ -256,6 +256,10 @@ class TrainOptions:
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, steps=(1, 10**8), checkpoint_every=(1, 10**8), seed=SEEDS)
+
 
 @dataclass(frozen=True, eq=False)
 class Training:
@@ -290,8 +294,6 @@ def train(options: TrainOptions) -> Path:
     device = chosen_device(options.device)
     method = METHODS[options.method]
     steps = method.steps if options.steps is None else options.steps
-    if steps < 1:
-        raise ArgumentError("steps", str(steps), "at least 1")
     capture = read_capture(options.capture)
     require_sound(capture)
     frames = training_frames(capture, method)

@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from handavatar.avatar import CheckpointError
-from handavatar.errors import ArgumentError, argument
+from handavatar.errors import SEEDS, ArgumentError, argument, require_ranges
 from handavatar.evaluate.metrics import mask_iou
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
 from handavatar.hand.open_hand import Level
@@ -114,6 +114,21 @@ class PriorOptions:
     folder: Path | None = None
     checkpoint_every: int = 1000
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            steps=(1, 10**8),
+            poses=(1, 1000),
+            points=(1, 10**6),
+            joint_points=(0, 10**6),
+            lr=(1e-12, 1),
+            final_lr=(1e-12, 1),
+            rounds=(0, 4),
+            seed=SEEDS,
+            checkpoint_every=(1, 10**8),
+        )
 
 
 def train_prior(
@@ -380,6 +395,10 @@ class PriorEvaluationOptions:
     rig: str = "open-hand"
     level: Level = "full"
     rounds: int = POINT_ROUNDS
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, poses=(1, 10**5), points=(2, 10**6), rounds=(0, 4))
 
 
 def evaluate_prior(options: PriorEvaluationOptions) -> dict[str, float]:

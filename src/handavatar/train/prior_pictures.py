@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 from torch import Tensor
 
+from handavatar.errors import require_ranges
 from handavatar.evaluate.geometry import Skin, Truth
 from handavatar.field.decoders import OccupancyField
 from handavatar.geometry.cameras import framing_camera
@@ -72,6 +73,10 @@ class PriorPictureOptions:
     level: Level = "full"
     rounds: int = POINT_ROUNDS
     truth: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, resolution=(2, 1024), size=(16, 4096), rounds=(0, 4))
 
 
 def picture_priors(options: PriorPictureOptions) -> list[Path]:

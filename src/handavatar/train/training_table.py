@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from handavatar.avatar import EXACT, HandAvatar, HandState, RayValues, RenderSettings
-from handavatar.errors import require_ranges
+from handavatar.errors import require_range, require_ranges
 from handavatar.evaluate.speed_table import hand_camera
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.field.occupancy import BOX_MARGIN, PairOccupancy, hand_codes
@@ -55,6 +55,17 @@ class TrainingTableOptions:
     steps: int = 8
     points: int = 1024
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            patch=(1, _PICTURE),
+            samples=(1, 4096),
+            plain_rays=(1, 10**6),
+            steps=(1, 10**6),
+            points=(1, 10**6),
+        )
+
     @property
     def total_steps(self) -> int:
         """The patch three times, and the steps both ways."""
@@ -89,7 +100,7 @@ def training_table(
         CheckpointError: if the avatar cannot be read.
         ArgumentError: if the patch does not fit, or has fewer rays than the plain way shall take.
     """
-    require_ranges(options, patch=(1, _PICTURE), plain_rays=(1, options.patch**2))
+    require_range("plain_rays", options.plain_rays, 1, options.patch**2)
     finished = step_counter(report)
     rows = _patch_rows(options, finished)
     plain, ours = _step_seconds(options, finished)

@@ -21,7 +21,7 @@ import torch
 
 from handavatar.avatar import HandAvatar, RenderSettings, chosen_device
 from handavatar.capture.motion import MOTIONS, Motion, read_motion
-from handavatar.errors import require_range
+from handavatar.errors import require_range, require_ranges
 from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.train.live import read_live
 from handavatar.train.runs import Run
@@ -71,6 +71,10 @@ class ViewOptions:
     out: Path = Path("edited")
     device: str = "auto"
     kernel: Kernel = "auto"
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, port=(0, 65_535))
 
 
 class PageServer:
