@@ -14,17 +14,15 @@ can execute what it reads.
 """
 
 import errno
-import fcntl
 import json
 import logging
 import os
 import re
 import shutil
-import socket
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from hashlib import sha256
@@ -47,11 +45,14 @@ from handavatar.jobs.files import (
     swap_folder,
 )
 from handavatar.jobs.finite import find_not_finite, require_finite
+from handavatar.jobs.locks import LockHeld, hold_lock
 from handavatar.train.provenance import package_versions, source_commit
 
 Json = dict[str, Any]
 
 _SCHEMA = 1
+LOCK = ".lock"
+"""Its name in the run's folder."""
 _KEPT_CHECKPOINTS = 3
 _MANIFEST = "MANIFEST.json"
 _STATE = "state.json"
@@ -75,7 +76,8 @@ def _is_older_run(folder: Path) -> bool:
 RUN = FolderKind(
     "run",
     (
-        *("options.json", "run.json", "seeds.json", "log.jsonl", "avatar.safetensors", ".lock"),
+        *("options.json", "run.json", "seeds.json", "log.jsonl", "avatar.safetensors"),
+        *(LOCK, f"{LOCK}-holder"),
         *(f"{kept}/step-*/*.{end}" for kept in ("checkpoints", "corrupt") for end in _ENDINGS),
         *(f"live/{name}" for name in ("avatar.safetensors", "progress.json", "watched")),
         *(f"evaluation/{name}" for name in (MARKER, "*.png", "metrics.json", "report.html")),
@@ -294,19 +296,15 @@ def locked(run: Run) -> Iterator[None]:
     Raises:
         CheckpointError: if another process holds it.
     """
-    with open(run.folder / ".lock", "a+", encoding="utf-8") as file:
+    with ExitStack() as held:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.seek(0)
-            holder = file.read(200).strip() or "another process"
+            held.enter_context(hold_lock(run.folder / LOCK))
+        except LockHeld as error:
             raise CheckpointError(
-                f"{run.folder}: {holder} is writing this run\n"
-                "wait until it has ended or stop it, or train into another folder with `out`"
+                f"{run.folder}: {error.found} is writing this run",
+                "",
+                "wait until it has ended or stop it, or train into another folder with `out`",
             ) from error
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}")
-        file.flush()
         yield
 
 
