@@ -237,7 +237,7 @@ def test_at_joints_both_parts_are_asked_and_not_the_deciding_one_alone() -> None
 
 def test_points_at_joints_are_for_pairs_alone(tmp_path: Path) -> None:
     options = replace(_options(tmp_path / "a"), decoder="coap", joint_points=10)
-    with pytest.raises(ValueError, match="10 points at joints for the decoder 'coap'"):
+    with pytest.raises(ValueError, match="`joint_points`: found 10 for the decoder 'coap'"):
         train_prior(options)
     assert not list(tmp_path.iterdir())
 

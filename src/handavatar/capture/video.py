@@ -125,6 +125,7 @@ class VideoOptions:
     def __post_init__(self) -> None:
         """Refuses numbers that are out of range."""
         require_ranges(self, camera_unit=(1e-6, 1e6), size=(16, 4096), min_confidence=(0, 1))
+        self.sampling()  # Refuses what selects nothing.
 
     def sampling(self) -> Sampling:
         """Which pictures of the video are taken.
@@ -192,7 +193,6 @@ def capture_video(
             pictures are the cause, a folder beside the would-be capture shows them.
     """
     report = progress or (lambda share, doing: None)
-    options.sampling()  # Refuses what selects nothing, before any work.
     videos = options.of_each_clip()
     if len(videos) > MAX_CLIPS:
         raise ArgumentError("more", f"{len(videos)} videos", f"at most {MAX_CLIPS} of one hand")

@@ -11,7 +11,7 @@ import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
 from handavatar.cli.inputs import Expected, require
-from handavatar.errors import require_range
+from handavatar.errors import ArgumentError, require_range
 
 Options = TypeVar("Options")
 
@@ -35,8 +35,8 @@ class Extra:
     help: str
     default: Any = ...
     is_positional: bool = False
-    least: float = 1
-    most: float = 0
+    least: int | float = 1
+    most: int | float = 0
 
 
 JSON = Extra("json", bool, "print one JSON object and nothing else", False)
@@ -111,20 +111,15 @@ def parse_with(
             default = dataclasses.field(default=values[field.name])
             fields.append((field.name, fixed, default))
             continue
+        if dataclasses.is_dataclass(field.type):
+            fields.append(_unchecked_field(field))
+            continue
         named = _comma_separated(field.type)
         kind = _positional(named, field.name) if field.name in positional else named
         # Either of the two is MISSING, which stands for none.
         defaults: Any = {"default": field.default, "default_factory": field.default_factory}
         fields.append((field.name, kind, dataclasses.field(**defaults)))
-    twin = dataclasses.make_dataclass(
-        options.__name__,
-        fields,
-        bases=(options,),
-        # What is out of range the dataclass itself says, outside of tyro.
-        namespace={"__post_init__": lambda self: None},
-        kw_only=True,
-        frozen=True,
-    )
+    twin: Any = _unchecked(options, fields)
     twin.__doc__ = about or options.__doc__
     parsed: Any = tyro.cli(
         twin, args=words, prog=f"handavatar {command}", config=(tyro.conf.FlagCreatePairsOff,)
@@ -132,7 +127,9 @@ def parse_with(
     for extra in extras:
         if extra.least <= extra.most:
             require_range(extra.name, getattr(parsed, extra.name), extra.least, extra.most)
-    found = {field.name: getattr(parsed, field.name) for field in own}
+    found = {
+        field.name: _rebuilt(getattr(parsed, field.name), field.type, field.name) for field in own
+    }
     found |= {name: value for name, value in values.items() if found[name] is None}
     for name, expected in (reads or {}).items():
         shown = name.upper() if name in positional else "--" + name.replace("_", "-")
@@ -142,6 +139,43 @@ def parse_with(
         options(**found),
         {extra.name: getattr(parsed, extra.name) for extra in extras},
     )
+
+
+def _unchecked(kind: type[Any], fields: list[tuple[str, Any, Any]]) -> type[Any]:
+    """A subclass that takes any values: tyro would make what its class says of them a riddle."""
+    namespace = {"__post_init__": lambda self: None}
+    return dataclasses.make_dataclass(
+        kind.__name__, fields, bases=(kind,), namespace=namespace, kw_only=True, frozen=True
+    )
+
+
+def _unchecked_field(field: dataclasses.Field[Any]) -> tuple[str, Any, Any]:
+    """A field that is an options class itself, for tyro."""
+    own: Any = field.type
+    within = [f for f in dataclasses.fields(own) if dataclasses.is_dataclass(f.type)]
+    kind = _unchecked(own, [_unchecked_field(each) for each in within])
+    given: Any = field.default_factory
+    return field.name, kind, dataclasses.field(default_factory=lambda: _rebuilt(given(), kind, ""))
+
+
+def _rebuilt(value: Any, kind: Any, name: str) -> Any:
+    """An options class within another as its own class, which looks at the values; else as it is.
+
+    Raises:
+        ArgumentError: one is out of range; it is named as in ``fit.focal_share``.
+    """
+    if not (dataclasses.is_dataclass(kind) and isinstance(kind, type)):
+        return value
+    try:
+        parts = {
+            field.name: _rebuilt(getattr(value, field.name), field.type, field.name)
+            for field in dataclasses.fields(kind)
+        }
+        return kind(**parts)
+    except ArgumentError as error:
+        raise ArgumentError(
+            f"{name}.{error.argument}", error.found, error.expected, error.remedy
+        ) from error
 
 
 def _paths(value: Any) -> list[Path]:

@@ -38,8 +38,7 @@ def chosen_kernel(name: Kernel, device: torch.device | str) -> Kernel:
     if not _has_triton():
         raise ArgumentError(
             "kernel",
-            f"{name} needs the package 'triton', which is not here; it comes with torch's builds "
-            "for CUDA",
+            f"{name}: there is no package 'triton' here; it comes with torch's builds for CUDA",
             "",
             "use `kernel='torch'`",
         )
