@@ -22,7 +22,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from handavatar.edit import Edit, Paint
-from handavatar.errors import ArgumentError, HandAvatarError, argument
+from handavatar.errors import ArgumentError, HandAvatarError, argument, raise_if_refused
 from handavatar.field.anchors import Neighbours, nearest_anchors, place_anchors
 from handavatar.field.kernels import SHORTER, Kernel, settled_kernel
 from handavatar.field.occupancy import HandCodes, PairItems, PairOccupancy, decided_items
@@ -1083,6 +1083,7 @@ def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             about = json.loads((file.metadata() or {}).get("handavatar", "null"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except Exception as error:
+        raise_if_refused(error)
         raise CheckpointError(
             f"{path}: cannot be read as safetensors ({error}); the file is damaged or not "
             "complete: copy it again or take it from the run's last checkpoint"

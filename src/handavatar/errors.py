@@ -220,6 +220,19 @@ def machine_error(error: BaseException) -> HandAvatarError | None:
     return None
 
 
+def raise_if_refused(error: BaseException) -> None:
+    """Raises what the machine refuses as such, for those who take all else for damage of a file.
+
+    Args:
+        error: that a reader has caught.
+
+    Raises:
+        HandAvatarError: as :func:`machine_error` gives it.
+    """
+    if (refused := machine_error(error)) is not None:
+        raise refused from error
+
+
 def _is_out_of_memory(error: BaseException, text: str) -> bool:
     if isinstance(error, MemoryError) or getattr(error, "errno", None) == errno.ENOMEM:
         return True

@@ -53,7 +53,7 @@ class Processes:
 
 def is_first_process() -> bool:
     """Whether this process is alone, or the one of ``torchrun``'s that reports."""
-    return os.environ.get("RANK", "0") == "0"
+    return os.environ.get("WORLD_SIZE", "1") == "1" or os.environ.get("RANK", "0") == "0"
 
 
 def _count() -> int:

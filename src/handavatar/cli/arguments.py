@@ -135,6 +135,9 @@ def parse_with(
         shown = name.upper() if name in positional else "--" + name.replace("_", "-")
         for path in _paths(getattr(parsed, name)):
             require(path, expected, f"{shown} of handavatar {command}")
+    for name in {*found, *(extra.name for extra in extras)} - set(reads or ()):
+        for path in _paths(getattr(parsed, name)) if _holds_paths(getattr(parsed, name)) else []:
+            _require_utf8(name, path)
     return (
         options(**found),
         {extra.name: getattr(parsed, extra.name) for extra in extras},
@@ -176,6 +179,20 @@ def _rebuilt(value: Any, kind: Any, name: str) -> Any:
         raise ArgumentError(
             f"{name}.{error.argument}", error.found, error.expected, error.remedy
         ) from error
+
+
+def _holds_paths(value: Any) -> bool:
+    return isinstance(value, Path) or (
+        isinstance(value, tuple) and any(isinstance(each, Path) for each in value)
+    )
+
+
+def _require_utf8(name: str, path: Path) -> None:
+    """What is written must be read again, and safetensors reads no file of another name."""
+    try:
+        str(path).encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise ArgumentError(name, str(path), "a name in UTF-8", "choose plain letters") from error
 
 
 def _paths(value: Any) -> list[Path]:

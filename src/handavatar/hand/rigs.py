@@ -11,6 +11,7 @@ from pathlib import Path
 from safetensors import SafetensorError
 from safetensors import torch as safetensors_torch
 
+from handavatar.errors import raise_if_refused
 from handavatar.hand.mano import LICENCE, WHERE_TO_GET_IT, ManoModel, read_mano
 from handavatar.hand.open_hand import Level, load_open_hand
 from handavatar.hand.rig import RIG_ARRAYS, LicensedRigMissing, Rig, RigError
@@ -92,6 +93,7 @@ def read_rig(path: Path) -> Rig:
             **{name: arrays[name] for name in _TENSORS},
         )
     except (KeyError, OSError, SafetensorError, RigError, RuntimeError) as error:
+        raise_if_refused(error)
         raise RigError(f"{path}: not a whole rig ({error})\nimport it again") from error
     if rig.sha256 != facts["sha256"]:
         raise RigError(

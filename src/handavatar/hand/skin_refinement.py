@@ -16,7 +16,7 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from handavatar.errors import SEEDS, require_ranges
+from handavatar.errors import SEEDS, raise_if_refused, require_ranges
 from handavatar.geometry.closest import closest_on_mesh
 from handavatar.geometry.meshes import uniform_laplacian_matrix, unique_edges
 from handavatar.geometry.rotations import (
@@ -143,6 +143,7 @@ class RefinementState:
             require_finite(tensors, "state")
             state = RefinementState(step=int(header["step"]), **tensors)
         except Exception as error:
+            raise_if_refused(error)
             raise RigError(
                 f"{path}: cannot be continued ({error}); delete it and begin anew"
             ) from error

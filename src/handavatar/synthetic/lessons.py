@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from handavatar.capture.checks import CaptureError
-from handavatar.errors import SEEDS, require_ranges
+from handavatar.errors import SEEDS, raise_if_refused, require_ranges
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
@@ -138,6 +138,7 @@ def train_made_tracker(
             require_finite(state, "state")
             training.restore(state)
         except (OSError, SafetensorError, KeyError, RuntimeError, NotFinite) as error:
+            raise_if_refused(error)
             raise CaptureError(
                 f"{state_file} cannot be gone on with ({error})", "train without `resume=True`"
             ) from error
@@ -247,5 +248,6 @@ def read_pictures(files: list[Path]) -> CropBatch:
         try:
             parts.append(load_file(file))
         except (OSError, SafetensorError) as error:
+            raise_if_refused(error)
             raise CaptureError(f"{file} cannot be read ({error})", "delete it") from error
     return CropBatch.joined(parts)

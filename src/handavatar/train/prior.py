@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from handavatar.avatar import CheckpointError
-from handavatar.errors import SEEDS, ArgumentError, argument, require_ranges
+from handavatar.errors import SEEDS, ArgumentError, argument, raise_if_refused, require_ranges
 from handavatar.evaluate.metrics import mask_iou
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
 from handavatar.hand.open_hand import Level
@@ -335,6 +335,7 @@ def load_prior(
         tensors = load_file(path)
         field.load_state_dict(tensors)
     except Exception as error:
+        raise_if_refused(error)
         raise CheckpointError(f"{path} is not a usable occupancy prior: {error}") from error
     if bad := find_not_finite(tensors):
         raise CheckpointError(
@@ -366,6 +367,7 @@ def _decoder_of(path: Path) -> Decoder:
         with safe_open(path, framework="pt") as file:
             found = (file.metadata() or {}).get("decoder", "pair")
     except Exception as error:
+        raise_if_refused(error)
         raise CheckpointError(f"{path} is not a usable occupancy prior: {error}") from error
     for decoder in get_args(Decoder):
         if decoder == found:

@@ -34,6 +34,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from handavatar.avatar import CheckpointError
+from handavatar.errors import raise_if_refused
 from handavatar.jobs.files import (
     MARKER,
     FolderInUse,
@@ -153,8 +154,9 @@ class CheckpointContents:
 
 
 def default_run_folder(capture: Path, method: str, outputs: Path = Path("outputs")) -> Path:
-    """``outputs/{capture}/{method}/{time}``, local time to the second."""
-    return outputs / capture.resolve().name / method / datetime.now().strftime("%Y-%m-%d_%H%M%S")
+    """``outputs/{capture}/{method}/{time}``, local time to the second; always in UTF-8."""
+    name = capture.resolve().name.encode("utf-8", "replace").decode().replace("?", "_")
+    return outputs / name / method / datetime.now().strftime("%Y-%m-%d_%H%M%S")
 
 
 def interrupted_run_folder(
@@ -454,6 +456,7 @@ def load_checkpoint(checkpoint: Checkpoint) -> CheckpointContents:
             else:
                 tensors[path.stem] = safetensors.torch.load(data)
         except (ValueError, RecursionError, SafetensorError) as error:
+            raise_if_refused(error)
             raise _broken(path, f"cannot be read ({error})") from error
     if found := find_not_finite({**tensors, "state": state}):
         raise _broken(checkpoint.folder, f"cannot be gone on from: {found}")
@@ -493,6 +496,7 @@ def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
             found = member.stat().st_size
             data = member.read_bytes() if found == size else b""
         except OSError as error:
+            raise_if_refused(error)
             raise _broken(member, f"cannot be read ({error.strerror})") from error
         if found != size:
             raise _broken(member, f"has {found} bytes, the manifest says {size}")
