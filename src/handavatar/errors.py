@@ -183,6 +183,7 @@ _NO_MEMORY = re.compile(
 # Safetensors hands on in words what the system said: "I/O error: No space left on device (os error
 # 28)", and "Path ... is not valid UTF-8".
 _IN_WORDS = re.compile(r"\(os error (\d{1,4})\)")
+_MISSING = re.compile(r"No such file or directory: (.+)")
 _NO_UTF8 = re.compile(r"Path (.+) is not valid UTF-8")
 _LESS_AT_ONCE = (
     "close other programs, or ask for less at once: fewer pixels or frames (`size`, `frames`, "
@@ -208,7 +209,7 @@ def machine_error(error: BaseException) -> HandAvatarError | None:
     if _is_out_of_memory(error, text):
         return OutOfSpace(f"out of memory ({text[:200]})", "", _LESS_AT_ONCE)
     if isinstance(error, OSError):
-        return _file_error(error)
+        return _file_error(_as_the_system_says(error, text))
     if isinstance(error, UnicodeEncodeError) and "surrogate" in error.reason:
         return _not_utf8(error.object)
     safetensors = sys.modules.get("safetensors")
@@ -241,6 +242,18 @@ def _is_out_of_memory(error: BaseException, text: str) -> bool:
     if torch is not None and isinstance(error, torch.OutOfMemoryError):
         return True
     return isinstance(error, RuntimeError) and bool(_NO_MEMORY.search(text))
+
+
+def _as_the_system_says(error: OSError, text: str) -> OSError:
+    """Safetensors calls every file that it cannot open missing: asked again, the system says why."""
+    said = _MISSING.fullmatch(text)
+    if error.errno is None and said:
+        try:
+            with open(said[1], "rb"):
+                pass
+        except OSError as true:
+            return true
+    return error
 
 
 def _not_utf8(name: str) -> PlaceRefused:
