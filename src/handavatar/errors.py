@@ -245,7 +245,7 @@ def _is_out_of_memory(error: BaseException, text: str) -> bool:
 
 
 def _as_the_system_says(error: OSError, text: str) -> OSError:
-    """Safetensors calls every file that it cannot open missing: asked again, the system says why."""
+    """Safetensors calls whatever it cannot open missing: asked again, the system says why."""
     said = _MISSING.fullmatch(text)
     if error.errno is None and said:
         try:
