@@ -2,6 +2,7 @@
 
 import errno
 import json
+import logging
 import subprocess
 import sys
 import time
@@ -116,6 +117,20 @@ def test_errors_become_exit_codes_and_a_few_lines(
     assert len(captured.err.splitlines()) <= 6
     assert cli.main(["train", "--debug"]) == code
     assert "Traceback" in capsys.readouterr().err
+
+
+def test_warnings_are_printed_once_with_flags_and_nothing_raw(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def warn(words: list[str]) -> int:
+        """Warns."""
+        logging.getLogger("handavatar.train.runs").warning("%s: use `overwrite=True`", "a\x1b[2J")
+        return 0
+
+    monkeypatch.setitem(cli.COMMANDS, "train", warn)
+    for _ in range(2):
+        assert cli.main(["train"]) == 0
+        assert capsys.readouterr().err == "handavatar: a\\x1b[2J: use --overwrite\n"
 
 
 def test_rig_info_prints_one_json_object(capsys: pytest.CaptureFixture[str]) -> None:

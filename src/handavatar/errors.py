@@ -1,8 +1,8 @@
 """Errors that a user can cause: five kinds, each with what was found, expected, and what to do.
 
 A message of the library never names a flag of the command line: it names an argument, between
-backticks, as Python writes it: ```overwrite=True```, ```num_samples```. The command line shows
-such a name as the flag it is there, ``--overwrite``, ``--num-samples``.
+backticks, as Python writes it, with a value as in overwrite=True or without. The command line shows
+such a name as the flag it is there, as in --overwrite.
 """
 
 import errno

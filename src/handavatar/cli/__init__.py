@@ -5,6 +5,7 @@ options are a dataclass beside the code it serves; its summary here is its docst
 """
 
 import difflib
+import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ from io import TextIOWrapper
 
 from handavatar import __version__
 from handavatar.cli import avatar, bench, capture, default, motion, prior, rig, tracker
-from handavatar.cli.failures import USAGE, report_failure
+from handavatar.cli.failures import USAGE, WarningsShown, report_failure
 
 Command = Callable[[list[str]], int]
 
@@ -60,6 +61,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Names of files may hold what is no character: shown as codes, never an error.
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    log = logging.getLogger("handavatar")
+    if not any(isinstance(handler, WarningsShown) for handler in log.handlers):
+        log.addHandler(WarningsShown())
     is_debugging = "--debug" in words
     words = [word for word in words if word != "--debug"]
     if words[:1] == ["--version"]:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
+from handavatar.cli.failures import shown
 from handavatar.cli.inputs import Expected, require
 from handavatar.errors import ArgumentError, require_range
 
@@ -249,4 +250,4 @@ def print_figures(value: dict[str, Any], indent: int = 0) -> None:
         elif isinstance(figure, float):
             print(f"{label}  {figure:.4g}")
         else:
-            print(f"{label}  {'-' if figure is None else figure}")
+            print(f"{label}  {'-' if figure is None else shown(str(figure))}")

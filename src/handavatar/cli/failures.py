@@ -1,6 +1,7 @@
 """Errors as exit codes and as a few lines that say what, where, why and what to do."""
 
 import ast
+import logging
 import re
 import shlex
 import sys
@@ -26,6 +27,15 @@ _EXTRAS = {
     "drjit": "synth",
     "anny": "anny",
 }
+
+
+class WarningsShown(logging.Handler):
+    """Warnings of the library, on standard error as its errors are."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Prints one; what no handler would have shown is not shown here either."""
+        if record.levelno >= logging.WARNING:
+            print(shown(f"handavatar: {self.format(record)}"), file=sys.stderr, flush=True)
 
 
 def report_failure(error: BaseException, is_debugging: bool = False) -> int:
