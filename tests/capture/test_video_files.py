@@ -373,11 +373,11 @@ def test_a_part_is_taken_and_what_is_not_looked_at_is_said(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("wrong", "word"),
     [
-        ({"fps": 0.0}, "--fps 0"),
-        ({"fps": math.nan}, "--fps nan"),
-        ({"max_frames": 0}, "--max-frames 0"),
-        ({"start": -1.0}, "--start -1"),
-        ({"start": 3.0, "end": 3.0}, "--end 3"),
+        ({"fps": 0.0}, "`fps`: found 0"),
+        ({"fps": math.nan}, "`fps`: found nan"),
+        ({"max_frames": 0}, "`max_frames`: found 0"),
+        ({"start": -1.0}, "`start`: found -1"),
+        ({"start": 3.0, "end": 3.0}, "`end`: found 3, expected more than `start=3`"),
     ],
 )
 def test_what_selects_nothing_is_refused(wrong: dict[str, float], word: str) -> None:

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from handavatar.errors import require_ranges
+from handavatar.errors import HandAvatarError, require_ranges
 from handavatar.evaluate.geometry import Skin, Truth
 from handavatar.field.decoders import OccupancyField
 from handavatar.geometry.cameras import framing_camera
@@ -110,6 +110,12 @@ def picture_priors(options: PriorPictureOptions) -> list[Path]:
         meshes = {}
         for name, field_of in fields.items():
             surface = extract_hand(field_of(hand), boxes, hand, options.resolution)
+            if len(surface.faces) == 0:
+                raise HandAvatarError(
+                    f"{name}: no surface is found at `resolution={options.resolution}`",
+                    "",
+                    "raise it; or is this no prior of this rig?",
+                )
             meshes[name] = (surface.vertices, surface.faces)
         path = options.out / f"{pose}.png"
         Image.fromarray(side_by_side(meshes, hand.vertices, options.size)).save(path)

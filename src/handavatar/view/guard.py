@@ -106,9 +106,7 @@ def guard_of(host: str, token: str) -> Guard:
         or not token.replace("-", "").replace("_", "").isalnum()
         or not token.isascii()
     ):
-        raise ArgumentError(
-            "token", "another sign, or more", "letters, digits, - and _, at most 200"
-        )
+        raise ArgumentError("token", "others, or too many", "letters, digits, - and _, at most 200")
     if is_loopback(host):
         return Guard(host, token)
     own = frozenset(name.lower() for name in (host, socket.gethostname()))
