@@ -1094,9 +1094,10 @@ def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         )
     if found := find_not_finite({**tensors, **about}):
         raise CheckpointError(
-            f"{path}: {found}, expected finite numbers\n"
+            f"{path}: {found}, expected finite numbers",
+            "",
             "copy the file again, or train again into its run, from the last checkpoint: "
-            f"handavatar train CAPTURE {argument('out', path.parent)} `resume='auto'`"
+            f"handavatar train CAPTURE {argument('out', path.parent)} `resume='auto'`",
         )
     return about, tensors
 

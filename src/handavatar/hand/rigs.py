@@ -122,8 +122,9 @@ def load_rig(reference: str, level: Level = "full") -> Rig:
         return load_open_hand("778")
     if level != "full":
         raise RigError(
-            f"rig {reference[:80]}: found level {level}, which the open hand alone has\n"
-            "leave out `level`: other rigs are used as they are"
+            f"rig {reference[:80]}: found level {level}, which the open hand alone has",
+            "",
+            "leave out `level`: other rigs are used as they are",
         )
     path = Path(reference)
     if path.suffix == ".pkl":
@@ -180,8 +181,9 @@ def _named(reference: str) -> Path:
         )
     if not named:
         raise LicensedRigMissing(
-            f"rig {reference[:80]}: not imported; {rigs_folder()} does not hold it\n"
-            f"{WHERE_TO_GET_IT}"
+            f"rig {reference[:80]}: not imported; {rigs_folder()} does not hold it",
+            "",
+            f"{WHERE_TO_GET_IT}",
         )
     return named[0]
 
@@ -205,8 +207,9 @@ def find_rig(sha256: str, name: str) -> Rig:
             return read_rig(path)
     if name.startswith("mano"):
         raise LicensedRigMissing(
-            f"rig {name} ({sha256[:12]}): not imported; {rigs_folder()} does not hold it\n"
-            f"{WHERE_TO_GET_IT}"
+            f"rig {name} ({sha256[:12]}): not imported; {rigs_folder()} does not hold it",
+            "",
+            f"{WHERE_TO_GET_IT}",
         )
     raise RigError(
         f"rig {name} ({sha256[:12]}): unknown; the open hand of this version is "

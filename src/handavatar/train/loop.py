@@ -896,8 +896,9 @@ def _require_same_training(run: Run, options: TrainOptions, capture: Capture) ->
     """A run goes on with what it was begun with, or not at all."""
     if run.options.get("avatar_schema") != SCHEMA:
         raise CheckpointError(
-            f"{run.folder}: was begun by a version whose weights mean something else\n"
-            "name another folder with `out`, or begin anew with `resume='never'`"
+            f"{run.folder}: was begun by a version whose weights mean something else",
+            "",
+            "name another folder with `out`, or begin anew with `resume='never'`",
         )
     facts = run.facts
     seed = read_seeds(run, facts["seed"])[-1].seed
@@ -908,8 +909,9 @@ def _require_same_training(run: Run, options: TrainOptions, capture: Capture) ->
     for what, old, new in zip(("capture", "seed", "method"), then, now, strict=True):
         if old != new:
             raise CheckpointError(
-                f"{run.folder}: was begun with {what} {str(old)[:12]}, now it is {str(new)[:12]}\n"
-                "name another folder with `out`, or begin anew with `resume='never'`"
+                f"{run.folder}: was begun with {what} {str(old)[:12]}, now it is {str(new)[:12]}",
+                "",
+                "name another folder with `out`, or begin anew with `resume='never'`",
             )
 
 

@@ -339,8 +339,9 @@ def load_prior(
         raise CheckpointError(f"{path} is not a usable occupancy prior: {error}") from error
     if bad := find_not_finite(tensors):
         raise CheckpointError(
-            f"{path} is not a usable occupancy prior: {bad}\n"
-            "copy the file again, or leave it out: the prior that ships is good"
+            f"{path} is not a usable occupancy prior: {bad}",
+            "",
+            "copy the file again, or leave it out: the prior that ships is good",
         )
 
 

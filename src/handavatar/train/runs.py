@@ -235,8 +235,9 @@ def create_run(
             raise FolderInUse(f"{folder}: not empty", "")
     except FolderInUse as error:
         raise CheckpointError(
-            f"{error.found}, expected a new folder\n"
-            "name another with `out`, or continue the run that is there with `resume='auto'`"
+            f"{error.found}, expected a new folder",
+            "",
+            "name another with `out`, or continue the run that is there with `resume='auto'`",
         ) from error
     return Run(folder)
 
@@ -285,8 +286,9 @@ def open_run(folder: Path) -> Run:
     """
     if not (folder / "run.json").is_file():
         raise CheckpointError(
-            f"{folder}: no run.json in it, so it is not a run folder\n"
-            "give the folder that handavatar train printed, under outputs/"
+            f"{folder}: no run.json in it, so it is not a run folder",
+            "",
+            "give the folder that handavatar train printed, under outputs/",
         )
     return Run(folder)
 
@@ -482,8 +484,9 @@ def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
         raise _broken(path, "is not a manifest (cut or overwritten)") from error
     if schema > _SCHEMA:
         raise CheckpointError(
-            f"{path}: written by a newer version (schema {schema}, this one knows {_SCHEMA})\n"
-            "update handavatar, or train again with this version"
+            f"{path}: written by a newer version (schema {schema}, this one knows {_SCHEMA})",
+            "",
+            "update handavatar, or train again with this version",
         )
     if step != checkpoint.step or _STATE not in files:
         raise _broken(path, f"does not belong to step {checkpoint.step}")
@@ -508,8 +511,9 @@ def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
 
 def _broken(path: Path, what: str) -> CheckpointError:
     return CheckpointError(
-        f"{path}: {what}\n"
-        "continue from the newest whole checkpoint with `resume='auto'`, or train again"
+        f"{path}: {what}",
+        "",
+        "continue from the newest whole checkpoint with `resume='auto'`, or train again",
     )
 
 
