@@ -22,7 +22,6 @@ import re
 import shutil
 import socket
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -40,11 +39,13 @@ from handavatar.jobs.files import (
     MARKER,
     FolderInUse,
     FolderKind,
+    fill_folder,
     is_empty,
     mark_folder,
+    put_in_place,
     read_marker,
     refuse_folder_in_use,
-    swap_folder,
+    write_atomically,
 )
 from handavatar.jobs.finite import find_not_finite, require_finite
 from handavatar.train.provenance import package_versions, source_commit
@@ -72,13 +73,15 @@ def _is_older_run(folder: Path) -> bool:
     return {"schema", "versions", "seed", "capture", "command"} <= facts.keys()
 
 
+_EVALUATION_FILES = ("*.png", "metrics.json", "report.html", "own_motion.mp4")
 RUN = FolderKind(
     "run",
     (
         *("options.json", "run.json", "seeds.json", "log.jsonl", "avatar.safetensors", ".lock"),
         *(f"{kept}/step-*/*.{end}" for kept in ("checkpoints", "corrupt") for end in _ENDINGS),
         *(f"live/{name}" for name in ("avatar.safetensors", "progress.json", "watched")),
-        *(f"evaluation/{name}" for name in (MARKER, "*.png", "metrics.json", "report.html")),
+        *(f"evaluation/{name}" for name in (MARKER, *_EVALUATION_FILES)),
+        *(f".evaluation.*/{name}" for name in (MARKER, *_EVALUATION_FILES)),
     ),
     _is_older_run,
 )
@@ -248,13 +251,11 @@ def _write_start(folder: Path, options: Json, facts: Json) -> None:
 def _replace_run(folder: Path, options: Json, facts: Json, capture: Path) -> None:
     """Puts the start of a run in the place of another one, which nobody may be training."""
     refuse_folder_in_use(folder, RUN, True, (capture,))
-    with tempfile.TemporaryDirectory(
-        prefix=f".{folder.name}.", suffix=".part", dir=folder.absolute().parent
-    ) as beside:
-        whole = Path(beside) / folder.name
+    with (
+        locked(Run(folder)),
+        fill_folder(folder, RUN, True, (capture,), is_complete=False) as whole,
+    ):
         _write_start(whole, options, facts)
-        with locked(Run(folder)):
-            swap_folder(whole, folder, RUN, True, (capture,))
 
 
 def is_unfinished_start(folder: Path) -> bool:
@@ -313,12 +314,7 @@ def locked(run: Run) -> Iterator[None]:
 def write_json(path: Path, value: Json) -> None:
     """Replaces a JSON file in one step; NaN is refused."""
     text = json.dumps(value, indent=2, allow_nan=False) + "\n"
-    aside = path.with_name(f".tmp-{os.getpid()}-{path.name}")
-    try:
-        _write_synced(aside, text.encode())
-        aside.replace(path)
-    finally:
-        aside.unlink(missing_ok=True)
+    write_atomically({path: text.encode()})
 
 
 # --- the log --------------------------------------------------------------------------------------
@@ -339,12 +335,7 @@ def read_log(run: Run) -> list[Json]:
 def truncate_log(run: Run, step: int) -> None:
     """Forgets what was logged after ``step``, so that a resumed log equals an uninterrupted one."""
     kept = b"".join(line for line, record in _log_lines(run) if record["step"] <= step)
-    aside = run.log.with_name(f".tmp-{os.getpid()}-log.jsonl")
-    try:
-        _write_synced(aside, kept)
-        aside.replace(run.log)
-    finally:
-        aside.unlink(missing_ok=True)
+    write_atomically({run.log: kept})
 
 
 def _log_lines(run: Run) -> Iterator[tuple[bytes, Json]]:
@@ -406,13 +397,9 @@ def save_checkpoint(
     try:
         aside.mkdir()
         for name, data in payloads.items():
-            _write_synced(aside / name, data)
-        _write_synced(aside / _MANIFEST, manifest)
-        _sync_folder(aside)
-        if final.exists():
-            final.rename(run.checkpoints / f".tmp-{os.getpid()}-{step}-replaced")
-        aside.rename(final)
-        _sync_folder(run.checkpoints)
+            (aside / name).write_bytes(data)
+        (aside / _MANIFEST).write_bytes(manifest)
+        put_in_place(aside, final)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
     _remove_leftovers(run)
@@ -540,21 +527,6 @@ def _require_free_space(folder: Path, num_bytes: int) -> None:
         raise OSError(
             errno.ENOSPC, f"a checkpoint needs {num_bytes} bytes free, found {free}", str(folder)
         )
-
-
-def _write_synced(path: Path, data: bytes) -> None:
-    with open(path, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def read_json(path: Path, remedy: str) -> Json:
