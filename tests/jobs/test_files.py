@@ -335,9 +335,9 @@ def test_a_folder_takes_its_place_when_it_is_filled(tmp_path: Path) -> None:
         (folder / "a.mp3").write_text("half")
         raise KeyboardInterrupt
     assert _texts(place) == {"sheets/a.pdf": "new"}
-    with fill_folder(place, SONGS, overwrite=True, is_complete=False) as folder:
+    with fill_folder(place, SONGS, overwrite=True) as folder:
         (folder / "a.mp3").write_text("newer")
-    assert _texts(place) == {"a.mp3": "newer"} and "files" not in (read_marker(place) or {})
+    assert _texts(place) == {"a.mp3": "newer"}
     assert list(place.parent.iterdir()) == [place]
 
 

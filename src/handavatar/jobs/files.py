@@ -552,7 +552,6 @@ def fill_folder(
     kind: FolderKind,
     overwrite: bool = False,
     inputs: Iterable[Path] = (),
-    is_complete: bool = True,
 ) -> Iterator[Path]:
     """Gives a folder to be filled, which takes its place when the block ends, marked and whole.
 
@@ -564,7 +563,6 @@ def fill_folder(
         kind: what it will be.
         overwrite: whether a folder of the same kind may be replaced.
         inputs: what the target may not hold.
-        is_complete: whether no file is added later: then the marker lists those that are there.
 
     Yields:
         An empty folder beside ``target``, with the marker.
@@ -586,8 +584,7 @@ def fill_folder(
         mark_folder(aside, kind, {"process": os.getpid(), "host": socket.gethostname()})
         yield aside
         mark_folder(aside, kind)
-        if is_complete:
-            name_files(aside)
+        name_files(aside)
         swap_folder(aside, target, kind, overwrite, inputs)
     finally:
         shutil.rmtree(aside, ignore_errors=True)

@@ -37,14 +37,11 @@ from torch import Tensor
 from handavatar.avatar import CheckpointError
 from handavatar.jobs.files import (
     MARKER,
-    FolderInUse,
     FolderKind,
-    fill_folder,
     is_empty,
     mark_folder,
     put_in_place,
     read_marker,
-    refuse_folder_in_use,
     write_atomically,
 )
 from handavatar.jobs.finite import find_not_finite, require_finite
@@ -58,7 +55,6 @@ _MANIFEST = "MANIFEST.json"
 _STATE = "state.json"
 _STEP_FOLDER = re.compile(r"step-(\d{9,})")
 _FILE_NAME = re.compile(r"[a-z][a-z0-9_]*\.(safetensors|json)")
-_ENDINGS = ("safetensors", "json")
 _MAX_MANIFEST_BYTES = 1 << 20
 
 _log = logging.getLogger(__name__)
@@ -73,19 +69,8 @@ def _is_older_run(folder: Path) -> bool:
     return {"schema", "versions", "seed", "capture", "command"} <= facts.keys()
 
 
-_EVALUATION_FILES = ("*.png", "metrics.json", "report.html", "own_motion.mp4")
-RUN = FolderKind(
-    "run",
-    (
-        *("options.json", "run.json", "seeds.json", "log.jsonl", "avatar.safetensors", ".lock"),
-        *(f"{kept}/step-*/*.{end}" for kept in ("checkpoints", "corrupt") for end in _ENDINGS),
-        *(f"live/{name}" for name in ("avatar.safetensors", "progress.json", "watched")),
-        *(f"evaluation/{name}" for name in (MARKER, *_EVALUATION_FILES)),
-        *(f".evaluation.*/{name}" for name in (MARKER, *_EVALUATION_FILES)),
-    ),
-    _is_older_run,
-)
-"""The folder that :func:`create_run` makes. What was rendered into it is not listed: it stays."""
+RUN = FolderKind("run", is_older=_is_older_run)
+"""The folder that :func:`create_run` makes."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +183,6 @@ def create_run(
     capture: Path,
     capture_sha256: str,
     perceptual: str,
-    overwrite: bool = False,
 ) -> Run:
     """Makes the folder with ``options.json`` and ``run.json``.
 
@@ -209,8 +193,6 @@ def create_run(
         capture: folder of the capture.
         capture_sha256: fingerprint of the capture's files.
         perceptual: the perceptual loss in use, ``lpips-vgg`` or the substitute's name.
-        overwrite: replace the run that lies there, unless it is being trained or holds files that
-            no training writes; a folder that is no run is never touched.
 
     Raises:
         CheckpointError: if the folder holds something already.
@@ -225,37 +207,18 @@ def create_run(
         "perceptual": perceptual,
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
     }
-    try:
-        if is_empty(folder) or is_unfinished_start(folder):
-            _write_start(folder, options, facts)
-        elif overwrite and (folder / "run.json").is_file():
-            _replace_run(folder, options, facts, capture)
-        else:
-            raise FolderInUse(f"{folder}: not empty", "")
-    except FolderInUse as error:
+    if not is_empty(folder) and not is_unfinished_start(folder):
         raise CheckpointError(
-            f"{error.found}, expected a new folder\n"
+            f"{folder}: not empty, expected a new folder\n"
             "name another with --out, or continue the run that is there with --resume auto"
-        ) from error
-    return Run(folder)
-
-
-def _write_start(folder: Path, options: Json, facts: Json) -> None:
+        )
+    run = Run(folder)
     folder.mkdir(parents=True, exist_ok=True)
     mark_folder(folder, RUN)
-    Run(folder).checkpoints.mkdir(exist_ok=True)
+    run.checkpoints.mkdir(exist_ok=True)
     write_json(folder / "options.json", options)
     write_json(folder / "run.json", facts)
-
-
-def _replace_run(folder: Path, options: Json, facts: Json, capture: Path) -> None:
-    """Puts the start of a run in the place of another one, which nobody may be training."""
-    refuse_folder_in_use(folder, RUN, True, (capture,))
-    with (
-        locked(Run(folder)),
-        fill_folder(folder, RUN, True, (capture,), is_complete=False) as whole,
-    ):
-        _write_start(whole, options, facts)
+    return run
 
 
 def is_unfinished_start(folder: Path) -> bool:
