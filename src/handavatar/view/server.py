@@ -108,7 +108,7 @@ class PageServer:
         """Stops answering and frees the port."""
         self._http.shutdown()
         self._http.server_close()
-        self._http.hang_up()
+        self._http.connections.end_all()
 
 
 Served = TypeVar("Served", bound=PageServer)
