@@ -181,7 +181,7 @@ def killed(job: Job, count: int, draw: random.Random) -> Score:
     length = time.monotonic() - begin
     new = [picture_of(path) for path in places]
     score = Score()
-    if old[0] == new[0]:
+    if old == new:
         score.wrong.append("old and new are the same: nothing was tested")
     for number in range(count):
         for path in places:
