@@ -22,6 +22,7 @@ from handavatar.capture.video import VideoOptions, capture_video
 from handavatar.errors import require_ranges
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.files import refuse_file_in_use
 
 _MOST_FPS = 240.0
 
@@ -59,6 +60,8 @@ class MotionFromOptions:
     """Of a file's camera; opengl has y up and z backwards."""
     focal: float | None = None
     """True focal length in pixels of the pictures that HaMeR or WiLoR saw, for their depths."""
+    overwrite: bool = False
+    """Replace a file at OUT."""
 
     def __post_init__(self) -> None:
         """Refuses numbers that are out of range."""
@@ -80,8 +83,10 @@ def motion_from(
     Raises:
         CaptureError: there is no hand in it, the poses have no times, or a file is not what it is
             said to be.
+        FolderInUse: there is a file at ``out`` already.
         LicensedRigMissing: a file cannot be read without the user's own MANO file.
     """
+    refuse_file_in_use(options.out, options.overwrite)
     if (options.source / "transforms.json").is_file():
         return motion_of_capture(read_capture(options.source), options.fps, tell)
     is_told = options.layout != "auto"

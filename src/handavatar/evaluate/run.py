@@ -50,7 +50,7 @@ from handavatar.evaluate.report import (
 from handavatar.evaluate.unseen import unseen_figures, unseen_pictures
 from handavatar.fit.register import RegisterOptions
 from handavatar.hand.pose import HandPose
-from handavatar.jobs.files import FolderKind, claim_folder
+from handavatar.jobs.files import FolderKind, fill_folder, refuse_folder_in_use, write_atomically
 from handavatar.jobs.video_writer import VideoWriter
 
 
@@ -144,7 +144,8 @@ def evaluate_run(
             f"lights {', '.join(map(str, range(avatar.num_lights)))}",
             "judge an avatar that was trained on these clips",
         )
-    claim_folder(out, EVALUATION)
+    inputs = (options.run, capture.folder)
+    refuse_folder_in_use(out, EVALUATION, True, inputs)
     frames = [capture.frame(index) for index in indices]
     if not options.full_size:
         frames = [frame.binned(FITTED_SIDE) for frame in frames]
@@ -152,7 +153,8 @@ def evaluate_run(
     protocols = _protocols(avatar, frames, capture.is_tracked, report)
     report(0.9, "measuring")
     metrics = _measured(options, capture, avatar, frames, protocols)
-    _write(out, metrics, avatar, capture, frames, protocols, options)
+    with fill_folder(out, EVALUATION, True, inputs) as folder:
+        _write(folder, metrics, avatar, capture, frames, protocols, options)
     return metrics
 
 
@@ -482,7 +484,7 @@ def _write(
     Image.fromarray(contact_sheet(rows, _SHEET)).save(out / "sheet.png")
     if capture.is_tracked:
         _film(out / "own_motion.mp4", capture, frames, main)
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=2))
+    write_atomically({out / "metrics.json": json.dumps(metrics, indent=2).encode()})
     figures = {key: value for key, value in metrics.items() if key not in ("notes", "protocols")}
     figures |= {f"protocol_{key}": value for key, value in metrics["protocols"].items()}
     for key in (*_OUTSIDE, "protocol"):
@@ -538,15 +540,15 @@ def _film(path: Path, capture: Capture, frames: list[Frame], protocol: _Protocol
     steps = steps[steps > 0]
     fps = 1 / float(steps.median()) if len(steps) else 1.0
     side = frames[0].camera.width
-    writer = VideoWriter(path, min(max(fps, 1.0), 60.0), frames[0].camera.height, 2 * side)
-    for place in order:
-        frame = frames[place]
-        shown = [frame.image.numpy(), picture(protocol.judged[place].rendered)]
-        shown = [greyed(pixels, frame.known) for pixels in shown]
-        if capture.side == "left":
-            shown = [pixels[:, ::-1] for pixels in shown]
-        writer.add(np.concatenate(shown, axis=1))
-    writer.close()
+    fps = min(max(fps, 1.0), 60.0)
+    with VideoWriter(path, fps, frames[0].camera.height, 2 * side) as writer:
+        for place in order:
+            frame = frames[place]
+            shown = [frame.image.numpy(), picture(protocol.judged[place].rendered)]
+            shown = [greyed(pixels, frame.known) for pixels in shown]
+            if capture.side == "left":
+                shown = [pixels[:, ::-1] for pixels in shown]
+            writer.add(np.concatenate(shown, axis=1))
 
 
 def _curves(run: Path) -> list[Curve]:

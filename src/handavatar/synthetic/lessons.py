@@ -17,7 +17,7 @@ from torch import Tensor
 from handavatar.capture.checks import CaptureError
 from handavatar.errors import SEEDS, raise_if_refused, require_ranges
 from handavatar.hand.rigs import load_rig
-from handavatar.jobs.files import write_atomically
+from handavatar.jobs.files import refuse_file_in_use, write_atomically
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
 from handavatar.synthetic.crops import MadeCrops, make_crops
 from handavatar.tracker.measures import TrackerFigures, measure_tracker
@@ -76,6 +76,8 @@ class TrackerTrainOptions:
     """learning rate at its highest"""
     resume: bool = False
     """go on where a training of this file ended, or was ended"""
+    overwrite: bool = False
+    """replace a file at OUT, and what a training of it has left"""
 
     def __post_init__(self) -> None:
         """Refuses numbers that are out of range."""
@@ -110,12 +112,15 @@ def train_made_tracker(
 
     Raises:
         CaptureError: nothing to go on with, or a damaged file.
+        FolderInUse: there is a file at ``out`` already.
         NotFinite: the loss, a weight or the optimiser's state is no longer finite; it names what,
             in which step, and how to go on.
         TrackerError: the file to start from is no tracker, or one of other points.
     """
     tell = report or (lambda doing, done, total, loss: None)
     state_file = options.out.with_suffix(".state")
+    for path in (options.out, state_file):
+        refuse_file_in_use(path, options.overwrite or options.resume)
     if options.resume and not state_file.is_file():
         raise CaptureError(
             f"{state_file}: there is nothing to go on with", "train without `resume=True`"
