@@ -18,6 +18,7 @@ from handavatar.capture.default import default_capture
 from handavatar.edit import Edit, bones_named
 from handavatar.evaluate.run import EvaluateOptions, evaluate_run
 from handavatar.jobs.files import FolderInUse, FolderKind, claim_folder, refuse_folder_in_use
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.train.loop import TrainOptions, train
 from handavatar.train.runs import RUN
 
@@ -52,8 +53,12 @@ class DemoOptions:
     seed: int = 0
 
 
-def run_demo(options: DemoOptions) -> Path:
+def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
     """Trains on the shipped capture, judges held-out poses, renders new ones, edits one.
+
+    Args:
+        options: where to, how much.
+        progress: told how far the whole demonstration is.
 
     Leaves ``avatar.safetensors``, ``metrics.json``, ``report.html``, ``overview.png``,
     ``novel_poses.mp4``, ``edits.png`` and the run itself in ``options.out``.
@@ -68,6 +73,10 @@ def run_demo(options: DemoOptions) -> Path:
     run = out / "run"
     claim_folder(out, DEMONSTRATION)
     begin = time.monotonic()
+    frames = float(options.frames)
+    stages = progress.stages(
+        {"training": 300.0, "judging": 40.0, "a video": 1.0 * frames, "edits": 5.0}
+    )
     _say("1/4 training on the shipped capture", begin)
     train(
         TrainOptions(
@@ -76,11 +85,12 @@ def run_demo(options: DemoOptions) -> Path:
             steps=options.steps,
             device=options.device,
             seed=options.seed,
-        )
+        ),
+        stages["training"],
     )
     shutil.copyfile(run / "avatar.safetensors", out / "avatar.safetensors")
     _say("2/4 judging held-out poses", begin)
-    metrics = evaluate_run(EvaluateOptions(run=run, device=options.device))
+    metrics = evaluate_run(EvaluateOptions(run=run, device=options.device), stages["judging"])
     shutil.copyfile(run / "evaluation" / "metrics.json", out / "metrics.json")
     shutil.copyfile(run / "evaluation" / "report.html", out / "report.html")
     Image.fromarray(overview(run / "evaluation")).save(out / "overview.png")
@@ -94,9 +104,11 @@ def run_demo(options: DemoOptions) -> Path:
             frames=options.frames,
             overwrite=True,
             device=options.device,
-        )
+        ),
+        stages["a video"],
     )
     shutil.copyfile(renders / "rgb.mp4", out / "novel_poses.mp4")
+    stages["edits"](0.0)
     _say("4/4 edits", begin)
     Image.fromarray(edited_pictures(HandAvatar.load(out / "avatar.safetensors"))).save(
         out / "edits.png"

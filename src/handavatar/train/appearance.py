@@ -15,6 +15,7 @@ from handavatar.avatar import HandAvatar, RenderSettings
 from handavatar.capture.frames import Frame
 from handavatar.field.anchors import Neighbours
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.render.volume import composite_sparse
 from handavatar.train.losses import color_loss
 
@@ -54,12 +55,26 @@ class SeenSamples:
 
 @torch.no_grad()
 def find_seen_samples(
-    avatar: HandAvatar, frames: list[Frame], settings: RenderSettings, stride: int
+    avatar: HandAvatar,
+    frames: list[Frame],
+    settings: RenderSettings,
+    stride: int,
+    progress: Progress = SILENT,
 ) -> SeenSamples:
     """Evaluates every ``stride``-th pixel of the hand, in both directions, of every frame.
 
     Pixels at the hand's border are left out: what they mix with the background is unknown. So are
     those of which nothing is known.
+
+    Args:
+        avatar: whose geometry.
+        frames: of training, their poses as training sees them.
+        settings: of the rays.
+        stride: pixels between two that are evaluated.
+        progress: told how many frames are done.
+
+    Raises:
+        Interrupted: if the command was told to stop.
     """
     weights, directed, indices, shares, normals, lights = [], [], [], [], [], []
     numbers, counts, colors, alphas, points = [], [], [], [], []
@@ -88,6 +103,7 @@ def find_seen_samples(
         alphas.append(alpha[is_covered])
         mean = composite_sparse(seen.weights, seen.rays, seen.points, len(x)) / alpha[:, None]
         points.append(mean[is_covered])
+        progress(number + 1, len(frames))
     starts = torch.cat(counts).cumsum(0)
     return SeenSamples(
         torch.cat(weights),

@@ -22,6 +22,7 @@ from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.plain import plain_rays
 from handavatar.train.labelled_poses import LabelledPose, PoseStream
 from handavatar.train.loop import learned_rays
@@ -75,14 +76,12 @@ class PatchCost:
     gradients: dict[str, Tensor]
 
 
-def training_table(
-    options: TrainingTableOptions, report: Callable[[int], None] | None = None
-) -> ResultTable:
+def training_table(options: TrainingTableOptions, progress: Progress = SILENT) -> ResultTable:
     """Measures a patch and a step of pre-training, each in the plain way and in ours.
 
     Args:
         options: what to measure.
-        report: told the number of pieces of work done.
+        progress: told the number of pieces of work done.
 
     Raises:
         CheckpointError: if the avatar cannot be read.
@@ -93,7 +92,7 @@ def training_table(
             f"training table: found a patch of {options.patch} pixels and {options.plain_rays} "
             f"plain rays, expected 1 to {_PICTURE} pixels and at most as many rays as it has"
         )
-    finished = step_counter(report)
+    finished = step_counter(progress, options.total_steps)
     rows = _patch_rows(options, finished)
     plain, ours = _step_seconds(options, finished)
     rows["pre-training step, plain"] = {"s": round(plain, 3), "ratio": 1.0, **_NOTHING}
