@@ -31,6 +31,8 @@ from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.signals import Interrupted, heard_signals, is_stopping, unbroken
 from handavatar.processes import Processes, joined_processes
 from handavatar.train.divergence import divergence_noted, take_seed
 from handavatar.train.labelled_poses import LabelledPose, PoseStream, labelled_pose
