@@ -15,6 +15,7 @@ from handavatar.avatar import CheckpointError
 from handavatar.capture.checks import CaptureError
 from handavatar.cli.arguments import JSON, Extra, parse, parse_with
 from handavatar.hand.rig import RigError
+from handavatar.jobs.progress import Progress
 
 
 def test_help_lists_every_command_and_answers_quickly() -> None:
@@ -99,7 +100,7 @@ def test_errors_become_exit_codes_and_a_few_lines(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def fail(words: list[str]) -> int:
+    def fail(words: list[str], progress: Progress) -> int:
         """Fails."""
         raise error
 

@@ -9,6 +9,7 @@ Everything goes to standard error, so that standard output stays free for result
 
 import json
 import math
+import shutil
 import sys
 import threading
 import time
@@ -197,7 +198,7 @@ class Board:
         self._stream = cast(IO[str] | None, stream)
         self._clock = clock
         self._lock = threading.RLock()
-        self._begin = clock()
+        self._begin = self._last_told = clock()
         self._expected = math.nan
         self._share = self._skipped = 0.0
         self._span = ("", 0.0, 0.0)
@@ -207,8 +208,9 @@ class Board:
         self._note = ""
         self._figures: dict[str, float] = {}
         self._has_told = self._has_ended = False
-        self._line = _LiveLine(self) if stream is not None and stream.isatty() else None
-        self._next = self._begin + (_FIRST_DRAWN if self._line else _FIRST_LINE)
+        self._is_terminal = stream is not None and stream.isatty()
+        self._has_drawn = False
+        self._next = self._begin + (_FIRST_DRAWN if self._is_terminal else _FIRST_LINE)
         self._woken = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -243,6 +245,7 @@ class Board:
             self._figures.update(figures)
             self._has_told = True
             now = self._clock()
+            self._last_told = now
             self._marks.append((now, counted[0]))
             while len(self._marks) > 2 and self._marks[0][0] < now - _SPEED_WINDOW:
                 self._marks.popleft()
@@ -254,19 +257,22 @@ class Board:
     ) -> None:
         """Takes note of what takes no time."""
         with self._lock:
-            self._enter(span)
+            is_new = self._enter(span)
             self._skipped += max(share - self._share, 0.0)
             self._share = self._span_share = share
             self._counted = counted
+            self._last_told = self._clock()
             self._marks.clear()
-            self._marks.append((self._clock(), counted[0]))
+            self._marks.append((self._last_told, counted[0]))
+        for listener in self.listeners:
+            listener(self.record(), is_new)
 
     def _enter(self, span: tuple[str, float, float]) -> bool:
         """Begins another stage; what was left out of those before took no time."""
         if span == self._span:
             return False
         is_same_job = span[0] == self._span[0]
-        now = self._clock()
+        now = self._last_told  # What came since then belongs to it, too.
         self._skipped += max(span[1] - max(self._share, self._span[1] + self._span[2]), 0.0)
         self._span, self._span_begin, self._span_share = span, now, span[1]
         self._marks.clear()
@@ -350,9 +356,9 @@ class Board:
         now = self._clock()
         if self._stream is None or now < self._next:
             return
-        if self._line is not None:
+        if self._is_terminal:
             self._next = now + _DRAWN_EVERY
-            self._line.draw()
+            self._draw()
         else:
             self._next = now + _LINE_EVERY
             self._write_line()
@@ -367,10 +373,15 @@ class Board:
             self._woken.set()
         if self._thread is not None:
             self._thread.join()
-        if self._line is not None:
-            self._line.close()
-        elif self._stream is not None and self._has_told:
-            self._write_line()
+        try:
+            if self._stream is None or not (self._has_told or self._has_drawn):
+                pass
+            elif self._is_terminal:
+                self._draw("\n")
+            else:
+                self._write_line()
+        except (OSError, ValueError):  # Standard error is closed: nobody reads.
+            self._stream = None
         self._has_ended = True
         for listener in self.listeners:
             listener(self.record(), True)
@@ -382,43 +393,19 @@ class Board:
         except (OSError, ValueError):  # Standard error is closed: nobody reads.
             self._stream = None
 
+    def _draw(self, end: str = "\r") -> None:
+        # The next drawing, or what others write, begins at the left again.
+        assert self._stream is not None
+        width = shutil.get_terminal_size().columns - 1
+        self._stream.write("\x1b[2K" + self.text()[:width] + end)
+        self._stream.flush()
+        self._has_drawn = True
+
     def _write_line(self) -> None:
         # In one piece: others may write lines from another thread.
         assert self._stream is not None
         self._stream.write(json.dumps(self.record()) + "\n")
         self._stream.flush()
-
-
-class _LiveLine:
-    """The line on a terminal."""
-
-    def __init__(self, board: Board) -> None:
-        self._board = board
-        self._live: Any = None
-
-    def draw(self) -> None:
-        # Read late: a short command needs no line.
-        from rich.console import Console
-        from rich.live import Live
-
-        if self._live is None:
-            console = Console(file=sys.stderr)
-            # Results go to standard output as they are.
-            self._live = Live(
-                self._text(), console=console, auto_refresh=False, redirect_stdout=False
-            )
-            self._live.start()
-        self._live.update(self._text(), refresh=True)
-
-    def close(self) -> None:
-        if self._live is not None:
-            self._live.update(self._text(), refresh=True)
-            self._live.stop()
-
-    def _text(self) -> Any:
-        from rich.text import Text
-
-        return Text(self._board.text(), no_wrap=True, overflow="ellipsis")
 
 
 @contextmanager

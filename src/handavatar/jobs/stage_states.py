@@ -1,8 +1,8 @@
-"""How far a long work is, kept in one file, so that who is interrupted goes on from there.
+"""How far a long work is, kept in files, so that who is interrupted goes on from there.
 
-The work is a row of stages. The file holds the state of the whole where a stage began, and what
-that stage says of itself. It is written where a stage begins, when the work is told to stop, and
-now and then; aside first, and only if all of it is finite.
+The work is a row of stages. ``NAME.safetensors`` holds the state of the whole where a stage began;
+``NAME.stage.safetensors`` what that stage says of itself, when the work is told to stop and now and
+then. Both are written aside first, and only if all of it is finite.
 """
 
 import json
@@ -91,28 +91,32 @@ NOT_KEPT = StageState()
 
 
 class StageStates:
-    """The stages of one work, in a file."""
+    """The stages of one work, in a folder."""
 
     def __init__(self, path: Path, fingerprint: str, names: Sequence[str]) -> None:
-        """Reads the file, if there is one that can be gone on from.
+        """Reads the files, if there are some that can be gone on from.
 
         Args:
-            path: of the file.
+            path: of both, without their endings.
             fingerprint: of all that the states depend on; states of another one are worthless.
             names: of the stages, in order.
         """
-        self._path, self._fingerprint, self._names = path, fingerprint, tuple(names)
+        whole, stage = state_files(path)
+        self._whole_file, self._stage_file = whole, stage
+        self._fingerprint, self._names = fingerprint, tuple(names)
         self._whole = WorkState({})
         self._name = ""
         self._read: WorkState | None = None
-        found = self._from_file()
-        if found is not None:
-            self._name, self._whole, self._read = found
+        found = _read_state(whole, {"fingerprint": fingerprint})
+        if found is not None and found.facts["name"] in names:
+            self._name, self._whole = found.facts["name"], WorkState(found.tensors, found.facts)
+            begun = _read_state(stage, {"fingerprint": fingerprint, "name": self._name})
+            self._read = None if begun is None else WorkState(begun.tensors, begun.facts)
 
     @property
     def whole(self) -> WorkState | None:
         """The state of the whole where the stage to go on with began; None begins the work."""
-        return self._whole if self._name else None
+        return WorkState(self._whole.tensors, self._whole.facts["facts"]) if self._name else None
 
     def is_done(self, name: str) -> bool:
         """Whether a stage lies before the one to go on with."""
@@ -124,61 +128,75 @@ class StageStates:
         Args:
             name: of the stage.
             whole: its state now.
-        """
-        if name != self._name:
-            now = whole()
-            tensors = {key: value.detach().cpu().clone() for key, value in now.tensors.items()}
-            self._name, self._whole, self._read = name, WorkState(tensors, now.facts), None
-            self.write(None)
-        return _KeptStage(self)
-
-    def read(self) -> WorkState | None:
-        """What the present stage has said of itself, before this process."""
-        return self._read
-
-    def write(self, stage: WorkState | None) -> None:
-        """Writes the state of the whole, and of the present stage.
 
         Raises:
             NotFinite: if something of it is not finite; nothing is written then.
             OSError: if the disk refuses.
         """
-        parts = {_WHOLE: self._whole.tensors} | ({_STAGE: stage.tensors} if stage else {})
-        tensors = {
-            f"{prefix}{name}": value.detach().cpu().contiguous().clone()
-            for prefix, group in parts.items()
-            for name, value in group.items()
-        }
-        facts = {"whole": self._whole.facts, "stage": None if stage is None else stage.facts}
-        require_finite({**tensors, "facts": facts}, f"stage {self._name}: not kept")
-        record = {"fingerprint": self._fingerprint, "name": self._name} | facts
+        if name != self._name:
+            with unbroken():
+                self._stage_file.unlink(missing_ok=True)
+                now = whole()
+                self._write(self._whole_file, name, now)
+            facts = {"name": name, "facts": now.facts}
+            self._name, self._whole, self._read = name, WorkState(now.tensors, facts), None
+        return _KeptStage(self)
+
+    def read(self) -> WorkState | None:
+        """What the present stage has said of itself, before this process."""
+        return (
+            None if self._read is None else WorkState(self._read.tensors, self._read.facts["facts"])
+        )
+
+    def write(self, stage: WorkState) -> None:
+        """Writes the state of the present stage; raises as :meth:`begin`."""
+        self._write(self._stage_file, self._name, stage)
+
+    def _write(self, path: Path, name: str, state: WorkState) -> None:
+        require_finite({**state.tensors, "facts": state.facts}, f"stage {name}: not kept")
+        record = {"fingerprint": self._fingerprint, "name": name, "facts": state.facts}
         text = json.dumps(record, allow_nan=False)
-        write_atomically({self._path: safetensors.torch.save(tensors, {"state": text})})
+        tensors = {
+            key: value.detach().cpu().contiguous().clone() for key, value in state.tensors.items()
+        }
+        write_atomically({path: safetensors.torch.save(tensors, {"state": text})})
 
     def remove(self) -> None:
         """Forgets all: the work is done."""
-        self._path.unlink(missing_ok=True)
+        for path in (self._stage_file, self._whole_file):
+            path.unlink(missing_ok=True)
 
-    def _from_file(self) -> tuple[str, WorkState, WorkState | None] | None:
-        if not self._path.is_file():
+
+def state_files(path: Path) -> tuple[Path, Path]:
+    """The files of a work: the whole, and the present stage.
+
+    Args:
+        path: of both, without their endings.
+    """
+    return path.with_name(f"{path.name}.safetensors"), path.with_name(
+        f"{path.name}.stage.safetensors"
+    )
+
+
+def _read_state(path: Path, expected: Json) -> WorkState | None:
+    """A state whose facts are those that are expected; None, with a warning, where it is not."""
+    if not path.is_file():
+        return None
+    try:
+        with safe_open(path, "pt") as file:
+            record = json.loads(file.metadata()["state"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if {key: record[key] for key in expected} != expected:
+            _log.warning("%s: is of other work, which is begun anew", path)
             return None
-        try:
-            with safe_open(self._path, "pt") as file:
-                record = json.loads(file.metadata()["state"])
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            if record["fingerprint"] != self._fingerprint or record["name"] not in self._names:
-                _log.warning("%s: of other work; it is begun anew", self._path)
-                return None
-            if found := find_not_finite({**tensors, "facts": record}):
-                raise ValueError(found)
-            parts = [
-                WorkState({k[len(at) :]: v for k, v in tensors.items() if k.startswith(at)}, facts)
-                for at, facts in ((_WHOLE, record["whole"]), (_STAGE, record["stage"] or {}))
-            ]
-        except (OSError, ValueError, KeyError, TypeError, RecursionError, SafetensorError) as error:
-            _log.warning("%s: cannot be gone on from (%s); it is begun anew", self._path, error)
-            return None
-        return record["name"], parts[0], None if record["stage"] is None else parts[1]
+        if not isinstance(record["name"], str) or not isinstance(record["facts"], dict):
+            raise ValueError("its facts are no state's")
+        if found := find_not_finite({**tensors, "facts": record}):
+            raise ValueError(found)
+    except (OSError, ValueError, KeyError, TypeError, RecursionError, SafetensorError) as error:
+        _log.warning("%s: cannot be gone on from (%s)", path, error)
+        return None
+    return WorkState(tensors, record)
 
 
 class _KeptStage(StageState):

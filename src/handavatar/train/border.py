@@ -67,7 +67,7 @@ def fit_border(
         :func:`~handavatar.train.losses.border_loss`.
     """
     generator = torch.Generator().manual_seed(seed)
-    parts = progress.stages({"borders": 0.11 * len(frames), "border": 0.22 * steps})
+    parts = progress.stages({"borders": 0.11 * len(frames), "border": 0.55 * steps})
     borders = _borders(avatar, frames if steps else [], parts["borders"])
 
     def loss_of_step() -> Float[Tensor, ""]:

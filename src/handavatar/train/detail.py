@@ -245,7 +245,7 @@ def learn_detail(
     Departs: the paper has no texture.
     """
     count = len(frames)
-    seconds = {"views": 0.3 * count, "unwrapping": 0.3 * count, "detail": 0.2 * steps}
+    seconds = {"views": 0.2 * count, "unwrapping": 0.3 * count, "detail": 0.06 * steps}
     parts = progress.stages(seconds)
     texture = avatar.give_texture(size)
     views = find_detail_views(avatar, frames, seen, parts["views"])

@@ -36,6 +36,7 @@ from handavatar.jobs.stage_states import (
     StageStates,
     WorkState,
     named_tensors,
+    state_files,
 )
 from handavatar.train.appearance import (
     SeenSamples,
@@ -74,6 +75,7 @@ from handavatar.train.pretraining import wide_and_narrow
 from handavatar.train.prior import SHIPPED_PRIOR, load_prior
 from handavatar.train.registration import register_training
 from handavatar.train.runs import (
+    UNFINISHED_STAGES,
     Checkpoint,
     Run,
     append_log,
@@ -345,7 +347,8 @@ def _train(options: TrainOptions, progress: Progress) -> Path:
             seen = None
             if method.warm_steps:
                 seen = _seen_samples(
-                    training, frames, method, checkpoint, options.seed, stages["samples"]
+                    *(training, frames, method, checkpoint, options.seed, stages["samples"]),
+                    StageStates(run.folder / _SAMPLES_STATE, work, ("samples", "light", "done")),
                 )
             start = done = _restore(run, checkpoint, training)
             edges = EdgeSet.of(training.avatar.rig)
@@ -392,14 +395,15 @@ def _train(options: TrainOptions, progress: Progress) -> Path:
             raise Interrupted(
                 f"{run.folder}: stopped {where}; the same command goes on from there"
             ) from stop
-        (run.folder / _DETAIL_STATE).unlink(missing_ok=True)
+        for name in UNFINISHED_STAGES:
+            for path in state_files(run.folder / name):
+                path.unlink(missing_ok=True)
         stages["saving"](1.0)
     return run.folder
 
 
-_GEOMETRY_STATE, _DETAIL_STATE = "geometry.unfinished.safetensors", "detail.unfinished.safetensors"
-"""Files of a run in which stages without checkpoints keep how far they are."""
-_WARM_STEP, _JOINT_STEP = 0.06, 3.0
+_GEOMETRY_STATE, _SAMPLES_STATE, _DETAIL_STATE = UNFINISHED_STAGES
+_WARM_STEP, _JOINT_STEP = 0.25, 2.2
 """Usual seconds of a step of the appearance alone, and of a frame of the other steps."""
 
 
@@ -420,11 +424,11 @@ def stage_seconds(method: Method, steps: int, count: int, is_corrected: bool) ->
         "registration": 2.0 * count if is_corrected else 0.0,
         "outlines": 0.03 * method.outline_rounds * method.outline_visits * count,
         "occupancy": 0.2 * count + 0.13 * method.personal_steps if method.personal_steps else 0.0,
-        "border": 0.11 * count + 0.4 * method.border_steps if method.border_steps else 0.0,
-        "samples": (0.9 if has_light else 0.4) * count if method.warm_steps else 0.0,
+        "border": 0.11 * count + 0.55 * method.border_steps if method.border_steps else 0.0,
+        "samples": (4.5 if has_light else 2.0) * count if method.warm_steps else 0.0,
         "train": _WARM_STEP * warm + _JOINT_STEP * method.frames * (steps - warm),
-        "detail": 0.8 * count + 0.2 * method.detail_steps if method.detail_size else 0.0,
-        "saving": 1.0,
+        "detail": 0.5 * count + 0.06 * method.detail_steps if method.detail_size else 0.0,
+        "saving": 2.0,
     }
 
 
@@ -643,9 +647,8 @@ def _fit_or_restore_outlines(
 ) -> dict[str, Tensor]:
     """Sets shape, poses and decoder as the outlines alone would have them, and returns these."""
     modules = _outline_modules(training)
-    kept = run.folder / _GEOMETRY_STATE
+    states = StageStates(run.folder / _GEOMETRY_STATE, fingerprint, _GEOMETRY_STAGES)
     if checkpoint is None:
-        states = StageStates(kept, fingerprint, _GEOMETRY_STAGES)
         fit_geometry(training, frames, method, options.seed, stages, states)
         tensors = {
             f"{prefix}{name}": value.clone()
@@ -657,7 +660,7 @@ def _fit_or_restore_outlines(
             _save(run, training, tensors, 0)
             states.remove()
         return tensors
-    kept.unlink(missing_ok=True)
+    states.remove()
     for name in _GEOMETRY_STAGES:
         stages[name].skip()
     training.avatar.occupancy.sharpness = method.sharpness
@@ -795,22 +798,39 @@ def _seen_samples(
     checkpoint: Checkpoint | None,
     seed: int,
     progress: Progress,
+    states: StageStates,
 ) -> SeenSamples:
-    """Found anew; the directions of light are those of the checkpoint, if it has them already."""
+    """Found once; the directions of light are those of the checkpoint, if it has them already."""
     has_light = method.cues.num_directions > 0
-    parts = progress.stages(
-        {"samples": 2.0 * len(frames), "light": 1.0 * len(frames) if has_light else 0.0}
-    )
+    seconds = {"samples": 2.7 * len(frames), "light": 1.8 * len(frames) if has_light else 0.0}
+    parts = progress.stages(seconds)
     avatar, corrected = training.avatar, corrected_frames(training, frames)
     settings = RenderSettings(num_samples=method.num_samples)
-    seen = find_seen_samples(avatar, corrected, settings, method.warm_stride, parts["samples"])
-    if not has_light:
+    directions = avatar.illumination.directions if has_light else torch.zeros(0)
+    if states.whole is not None and states.is_done("samples"):
+        tensors = dict(states.whole.tensors)
+        placed = tensors.pop("directions", directions)
+        seen = SeenSamples.of(tensors).moved_to(avatar.device)
+        parts["samples"].skip()
+    else:
+        state = states.begin("samples", lambda: WorkState({}))
+        stride = method.warm_stride
+        seen = find_seen_samples(avatar, corrected, settings, stride, parts["samples"], state)
+    if states.is_done("light"):
+        directions.copy_(placed)
+        parts["light"].skip()
         return seen
-    if checkpoint is None or checkpoint.step == 0:
-        return place_directions(avatar, corrected, seen, seed, parts["light"])
-    stored = load_checkpoint(checkpoint).tensors["model"]["avatar.illumination.directions"]
-    avatar.illumination.directions.copy_(stored)
-    return relit(avatar, corrected, seen, parts["light"])
+    found = seen
+    if has_light:
+        state = states.begin("light", lambda: WorkState(found.tensors()))
+        if checkpoint is None or checkpoint.step == 0:
+            seen = place_directions(avatar, corrected, seen, seed, parts["light"], state)
+        else:
+            stored = load_checkpoint(checkpoint).tensors["model"]
+            directions.copy_(stored["avatar.illumination.directions"])
+            seen = relit(avatar, corrected, seen, parts["light"], state)
+    states.begin("done", lambda: WorkState(seen.tensors() | {"directions": directions}))
+    return seen
 
 
 @torch.no_grad()

@@ -70,7 +70,7 @@ def fit_occupancy(
     loss_of = OccupancyLoss(avatar.occupancy, avatar.parts, StageTimes())
     generator = torch.Generator().manual_seed(seed)
     # Hands and labels cost as much as a step: once for all steps, one of every pose.
-    parts = progress.stages({"hands": 0.3 * len(poses), "occupancy": 0.13 * steps})
+    parts = progress.stages({"hands": 0.2 * len(poses), "occupancy": 0.13 * steps})
     hands = _known_hands(avatar, poses if steps else [], seed, parts["hands"])
 
     def loss_of_step() -> Float[Tensor, ""]:

@@ -2,6 +2,7 @@
 
 ```
 run/  options.json  run.json  seeds.json  log.jsonl  avatar.safetensors  .lock  .handavatar
+      {geometry,samples,detail}.unfinished[.stage].safetensors
       checkpoints/step-000001000/{model,optimizer}.safetensors  state.json  MANIFEST.json
       corrupt/  evaluation/  renders/
 ```
@@ -72,11 +73,14 @@ def _is_older_run(folder: Path) -> bool:
     return {"schema", "versions", "seed", "capture", "command"} <= facts.keys()
 
 
+UNFINISHED_STAGES = ("geometry.unfinished", "samples.unfinished", "detail.unfinished")
+"""Files of a run, without their endings, in which stages between checkpoints keep their state."""
 RUN = FolderKind(
     "run",
     (
         *("options.json", "run.json", "seeds.json", "log.jsonl", "avatar.safetensors", ".lock"),
         *(f"{kept}/step-*/*.{end}" for kept in ("checkpoints", "corrupt") for end in _ENDINGS),
+        *(f"{name}{end}.safetensors" for name in UNFINISHED_STAGES for end in ("", ".stage")),
         *(f"live/{name}" for name in ("avatar.safetensors", "progress.json", "watched")),
         *(f"evaluation/{name}" for name in (MARKER, "*.png", "metrics.json", "report.html")),
     ),
