@@ -32,6 +32,7 @@ from handavatar import animate, cli
 from handavatar.capture import pathtracer
 from handavatar.evaluate import run as evaluating
 from handavatar.export import run as exporting
+from handavatar.field.shading import TracedCues
 from handavatar.jobs import signals
 from handavatar.jobs.progress import duration
 from handavatar.train.loop import METHODS
@@ -40,6 +41,7 @@ IMPORTED = (animate, pathtracer, evaluating, exporting)
 """Once, before all forks."""
 
 SMALL = {
+    "cues": TracedCues(14),
     "outline_rounds": 2,
     "outline_visits": 1,
     "personal_steps": 12,
@@ -65,6 +67,7 @@ def road(folder: Path) -> dict[str, tuple[list[str], Path]]:
     """The commands by name, and what each leaves."""
     capture, run = folder / "capture", folder / "run"
     sizes = ["--size", "40", "--train-frames", "3", "--test-frames", "1", "--samples", "2"]
+    budget = ["--steps", str(STEPS), "--perceptual", "substitute"]
     pictures = ["--size", "24", "--frames", "4", "--num-samples", "24"]
     return {
         "capture synth": (
@@ -72,7 +75,7 @@ def road(folder: Path) -> dict[str, tuple[list[str], Path]]:
             capture,
         ),
         "train": (
-            ["train", str(capture), "--method", "best", "--out", str(run), "--steps", str(STEPS)],
+            ["train", str(capture), "--method", "best", "--out", str(run), *budget],
             run / "avatar.safetensors",
         ),
         "render": (

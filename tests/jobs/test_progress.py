@@ -23,7 +23,7 @@ def _board(stream: io.StringIO, clock: _Clock) -> Board:
     return Board("train", stream, clock)
 
 
-def test_without_a_terminal_a_json_line_soon_and_then_every_ten_seconds() -> None:
+def test_without_a_terminal_a_json_line_soon_and_then_every_eight_seconds() -> None:
     stream, clock = io.StringIO(), _Clock()
     board = _board(stream, clock)
     step = Progress(board).stages({"steps": 50.0})["steps"]
@@ -33,16 +33,16 @@ def test_without_a_terminal_a_json_line_soon_and_then_every_ten_seconds() -> Non
         board.show()
     board.end(is_whole=False)
     lines = [json.loads(line) for line in stream.getvalue().splitlines()]
-    assert [line["step"] for line in lines] == [8, 28, 48, 50]
+    assert [line["step"] for line in lines] == [8, 24, 40, 50]
     assert lines[1] == {
         "command": "train",
-        "share": 0.28,
-        "seconds_left": 36,
+        "share": 0.24,
+        "seconds_left": 38,
         "job": "steps",
-        "step": 28,
+        "step": 24,
         "total": 100,
         "steps_per_second": 2.0,
-        "psnr": 22.8,
+        "psnr": 22.4,
         "loss": None,
     }
 

@@ -29,7 +29,7 @@ Number = int | float
 
 _SPEED_WINDOW = 30.0
 """Seconds over which the speed of a stage's steps is averaged."""
-_FIRST_LINE, _LINE_EVERY = 4.0, 10.0
+_FIRST_LINE, _LINE_EVERY = 4.0, 8.0
 """Seconds until the first JSON line, and between two."""
 _FIRST_DRAWN, _DRAWN_EVERY = 0.7, 0.25
 """Seconds until the line on a terminal, and between two drawings."""

@@ -337,7 +337,7 @@ def _train(options: TrainOptions, progress: Progress) -> Path:
         )
         checkpoint = latest_checkpoint(run)
         take_seed(run, begun, options.seed, checkpoint.step if checkpoint else 0)
-        work = _fingerprint(capture, method, options, steps, perceptual.name)
+        work = _fingerprint(capture, method, options)
         done = 0
         try:
             outlines = _fit_or_restore_outlines(
@@ -386,7 +386,9 @@ def _train(options: TrainOptions, progress: Progress) -> Path:
                 _learn_detail(
                     *(training, capture, frames, seen, perceptual, method, options.seed),
                     stages["detail"],
-                    StageStates(run.folder / _DETAIL_STATE, work, ("detail",)),
+                    StageStates(
+                        run.folder / _DETAIL_STATE, f"{work} {steps} {perceptual.name}", ("detail",)
+                    ),
                 )
             stages["saving"](0.0)
             count_seen_anchors(training.avatar, corrected_frames(training, frames))
@@ -432,14 +434,12 @@ def stage_seconds(method: Method, steps: int, count: int, is_corrected: bool) ->
     }
 
 
-def _fingerprint(
-    capture: Capture, method: Method, options: TrainOptions, steps: int, perceptual: str
-) -> str:
-    """Of all that the state of a stage depends on."""
-    budget = asdict(method) | {"cues": method.cues.name, "steps": steps}
+def _fingerprint(capture: Capture, method: Method, options: TrainOptions) -> str:
+    """Of all that the state of a stage before the first step depends on."""
+    budget = asdict(method) | {"cues": method.cues.name}
     own = {"seed": options.seed, "prior": sha256(options.prior.read_bytes()).hexdigest()}
     own |= {"capture": capture.sha256, "version": __version__, "schema": SCHEMA}
-    record = {"budget": budget, "perceptual": perceptual} | own
+    record = {"budget": budget} | own
     return sha256(json.dumps(record, default=str).encode()).hexdigest()
 
 
