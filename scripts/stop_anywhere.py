@@ -3,8 +3,8 @@
     OMP_NUM_THREADS=1 .venv/bin/python scripts/stop_anywhere.py --count 50 --folder stopped
     OMP_NUM_THREADS=1 .venv/bin/python scripts/stop_anywhere.py --gaps train CAPTURE --out RUN
 
-The road: a small made capture, a training with a small budget, pictures, figures, a surface. It is gone
-once without a stop. Then, again and again, one of its commands gets SIGTERM at a moment drawn
+The road: a small made capture, a training with a small budget, pictures, figures, a surface. It is
+gone once without a stop. Then, again and again, one of its commands gets SIGTERM at a moment drawn
 evenly from the whole road, ends, is given again, and must leave the same bits. Told are how many
 did, the longest time from the signal to the end, and the longest silence on standard error. Each
 command is a fork, so that imports are done once.
@@ -118,7 +118,7 @@ def run_command(words: list[str], stop_after: float | None = None) -> Ended:
     if child == 0:
         os.dup2(writing, 2)
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        sys.stdout, sys.stderr = (open(n, "w", buffering=1, encoding="utf-8") for n in (1, 2))
+        sys.stdout, sys.stderr = (os.fdopen(n, "w", buffering=1) for n in (1, 2))
         os._exit(run_small(words))
     os.close(writing)
     ended = Ended(0, 0.0)
@@ -246,17 +246,22 @@ def watched_stop_points(least: float = 0.5) -> Iterator[list[tuple[float, str]]]
     found: list[tuple[float, str]] = []
 
     class Watched(signals._Listening):
-        last = time.monotonic()
+        last = time.monotonic(), time.thread_time()
 
         def __getattribute__(self, name: str) -> object:
             is_main = threading.current_thread() is threading.main_thread()
             if name == "received" and is_main and not super().__getattribute__("num_unbroken"):
-                now = time.monotonic()
-                if now - Watched.last >= least:
+                now, busy = time.monotonic(), time.thread_time()
+                if busy - Watched.last[1] >= least:
                     places = traceback.extract_stack()[-6:-1]
                     where = " < ".join(f"{p.name}:{p.lineno}" for p in reversed(places))
-                    found.append((now - Watched.last, where))
-                Watched.last = now
+                    found.append(
+                        (
+                            busy - Watched.last[1],
+                            f"{now - Watched.last[0]:.2f} by the clock, until {where}",
+                        )
+                    )
+                Watched.last = now, busy
             return super().__getattribute__(name)
 
     before = signals._Listening
@@ -274,7 +279,7 @@ def tell_gaps(words: list[str]) -> int:
         code = cli.main(words)
     print(f"{' '.join(words)}: exit code {code}, {duration(time.monotonic() - begin)}")
     for seconds, where in sorted(found, reverse=True)[:15]:
-        print(f"{seconds:.2f} s until {where}")
+        print(f"{seconds:.2f} s of a core, {where}")
     return code
 
 

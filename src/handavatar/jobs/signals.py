@@ -2,7 +2,7 @@
 
 The first signal is a wish. It is answered at once on standard error, and the work ends at its next
 stop point, with :class:`Interrupted`: who catches that saves what there is. Where no stop point is
-come by within a second and a half, the main thread is interrupted as by Python itself. The second
+come by within some more than a second, the main thread is interrupted as by Python itself. The second
 signal kills at once. Before the first stop point, as long as imports last and nothing has been
 begun, the first one ends the process, too.
 """
@@ -18,7 +18,7 @@ from types import FrameType
 INTERRUPTED = 130
 """Exit code of a process that was told to stop."""
 _WATCHED = (signal.SIGINT, signal.SIGTERM)
-_PATIENCE = 1.5
+_PATIENCE = 1.2
 """Seconds within which a stop point should be come by."""
 _AGAIN = 0.1
 """Seconds after which it is tried again, where something must not be broken off."""

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import find_not_finite, require_finite
-from handavatar.jobs.signals import Interrupted, unbroken
+from handavatar.jobs.signals import unbroken
 
 Json = dict[str, Any]
 
@@ -64,7 +64,7 @@ class StageState:
         """As long as the block lasts, its state is kept when the work is told to stop.
 
         Args:
-            state: of the stage now, which is asked for at stop points and between steps.
+            state: of the stage now, whole wherever the block is not :func:`unbroken`.
 
         Yields:
             To be called after every step: then the state is kept now and then.
@@ -80,7 +80,7 @@ class StageState:
 
         try:
             yield now_and_then
-        except Interrupted:
+        except KeyboardInterrupt:  # Anywhere but in what is unbroken: there alone a state changes.
             with unbroken():
                 self.write(state())
             raise

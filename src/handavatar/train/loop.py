@@ -393,7 +393,7 @@ def _train(options: TrainOptions, progress: Progress) -> Path:
             stages["saving"](0.0)
             count_seen_anchors(training.avatar, corrected_frames(training, frames))
             training.avatar.save(run.avatar)
-        except Interrupted as stop:
+        except KeyboardInterrupt as stop:
             raise Interrupted(
                 f"{run.folder}: stopped {where}; the same command goes on from there"
             ) from stop
