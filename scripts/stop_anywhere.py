@@ -184,7 +184,7 @@ def measure(count: int, folder: Path, seed: int) -> int:
         print(f"{name}: {ended.seconds:.1f} s without a stop, silence {ended.silence:.1f} s")
     expected = {name: contents(place) for name, (_, place) in steps.items()}
     ends: list[Ended] = []
-    different, before = [], {name: 0 for name in steps}
+    different, before, was_stopped = [], {name: 0 for name in steps}, 0
     for number in range(count):
         moment = draw.uniform(0.0, sum(lasts.values()))
         for name in steps:
@@ -206,6 +206,7 @@ def measure(count: int, folder: Path, seed: int) -> int:
         again = run_command(words)
         is_same = again.code == 0 and contents(place) == expected[name]
         is_clean = first.code in (0, signals.INTERRUPTED, -signal.SIGTERM)
+        was_stopped += first.code != 0
         if not is_same or not is_clean or leftovers(folder_of):
             different.append(f"{folder_of.name}: {name} after {moment:.2f} s, code {first.code}")
         ends += [first, again]
@@ -218,7 +219,7 @@ def measure(count: int, folder: Path, seed: int) -> int:
         if is_same:
             shutil.rmtree(folder_of)
     stopping = [end.stopping for end in ends]
-    print(f"stopped: {count}, by command {before}")
+    print(f"told to stop: {count}, by command {before}; {was_stopped} before they had ended")
     print(f"the same afterwards: {count - len(different)} of {count}")
     print(f"from signal to exit: at most {max(stopping):.2f} s")
     print(f"silence: at most {max(end.silence for end in ends):.1f} s")

@@ -359,7 +359,7 @@ class _StoppedIn:
 
 
 _SOME = (("outlines", 3), ("occupancy", 1), ("samples", 1), ("train", 5), ("detail", 1))
-_REGISTRATION = (("poses", 29), ("poses", 71), ("offsets", 2))
+_REGISTRATION = (("poses", 28), ("poses", 71), ("offsets", 2))
 _BEFORE_STEPS = (("outlines", 3), ("hands", 1), ("occupancy", 1), ("border", 1))
 _WITH_LIGHT = (("samples", 2), ("sky", 1), ("tracing light", 3))
 _STEPS_AND_DETAIL = (("train", 1), ("train", 5), ("views", 2), ("unwrapping", 1), ("detail", 1))

@@ -2,9 +2,9 @@
 
 The first signal is a wish. It is answered at once on standard error, and the work ends at its next
 stop point, with :class:`Interrupted`: who catches that saves what there is. Where no stop point is
-come by within some more than a second, the main thread is interrupted as by Python itself. The second
-signal kills at once. Before the first stop point, as long as imports last and nothing has been
-begun, the first one ends the process, too.
+come by within some more than a second, the main thread is interrupted as by Python itself. The
+second signal kills at once. Before the first stop point, as long as imports last and nothing has
+been begun, the first one ends the process, too.
 """
 
 import os

@@ -664,7 +664,9 @@ def _fit_or_restore_outlines(
     for name in _GEOMETRY_STAGES:
         stages[name].skip()
     training.avatar.occupancy.sharpness = method.sharpness
-    stored = load_checkpoint(checkpoint).tensors
+    contents = load_checkpoint(checkpoint)
+    stored = contents.tensors
+    training.avatar.info |= contents.state.get("learned", {})  # Older checkpoints have none.
     tensors = stored["outlines"]
     if "parts" in stored:  # Older checkpoints have none; they are drawn alike.
         _set_part_points(training, stored["parts"])
@@ -764,8 +766,12 @@ def _whole(training: Training) -> WorkState:
     points = training.avatar.parts.points
     tensors = model_tensors(training) | {"coefficients": training.avatar.coefficients}
     tensors |= {"parts.corners": points.faces, "parts.barycentric": points.barycentric}
-    error = training.avatar.info.get("pose_error")
-    return WorkState(tensors, {} if error is None else {"pose_error": error})
+    return WorkState(tensors, _learned_facts(training))
+
+
+def _learned_facts(training: Training) -> dict[str, Any]:
+    """What the avatar says of itself that was learned before the first step."""
+    return {name: v for name, v in training.avatar.info.items() if name == "pose_error"}
 
 
 def _restore_whole(training: Training, whole: WorkState) -> None:
@@ -1127,7 +1133,10 @@ def _save(run: Run, training: Training, outlines: dict[str, Tensor], step: int) 
     parts = {"corners": points.faces, "barycentric": points.barycentric}
     tensors = {"model": model_tensors(training), "outlines": outlines, "parts": parts}
     tensors |= {name: optimizer_tensors(part) for name, part in training.optimizers.items()}
-    state = {name: optimizer_options(part) for name, part in training.optimizers.items()}
+    state: dict[str, Any] = {
+        name: optimizer_options(part) for name, part in training.optimizers.items()
+    }
+    state["learned"] = _learned_facts(training)
     save_checkpoint(run, step, tensors, state)
 
 
