@@ -58,7 +58,7 @@ MAY_IMPORT = {
         "view": "geometry jobs hand capture field render edit avatar retouch animate train webcam "
         "tracker",
         # What words and pictures mean to an avatar.
-        "retouch": "hand capture edit avatar",
+        "retouch": "jobs hand capture edit avatar",
         "processes": "",
         # Motions to pictures: what a viewer may see, the rasteriser's neighbours, and the kernels'
         # names.

@@ -11,6 +11,7 @@ from PIL import Image
 from handavatar.avatar import HandAvatar, Rendering, RenderSettings
 from handavatar.capture.checks import CaptureError
 from handavatar.edit import Edit
+from handavatar.jobs.files import FolderInUse
 from handavatar.retouch import EditOptions, Look, anchor_places, paint_from, save_edited
 
 FEW = RenderSettings(num_samples=24)
@@ -88,7 +89,7 @@ def test_an_edit_is_saved_into_an_avatar_and_the_next_comes_on_top(
     assert torch.equal(_seen(HandAvatar.load(again)).albedo, _seen(edited).albedo)
     # What was there is not touched.
     assert HandAvatar.load(tmp_path / "plain.safetensors").edit == Edit()
-    with pytest.raises(CaptureError, match=r"edited.safetensors exists"):
+    with pytest.raises(FolderInUse, match=r"edited.safetensors exists"):
         save_edited(EditOptions(tmp_path / "plain.safetensors", saved))
 
 

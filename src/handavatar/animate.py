@@ -28,7 +28,13 @@ from handavatar.geometry.cameras import Camera
 from handavatar.geometry.colors import eight_bits
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
-from handavatar.jobs.files import FolderKind, UnfinishedFolder, files_named, refuse_folder_in_use
+from handavatar.jobs.files import (
+    FolderKind,
+    UnfinishedFolder,
+    files_named,
+    refuse_folder_in_use,
+    write_atomically,
+)
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.video_writer import VideoWriter
 from handavatar.processes import joined_processes
@@ -257,19 +263,17 @@ def _join_frames(
 ) -> None:
     """Makes the videos, and one file of the frames' errors, from what all processes wrote."""
     for number, name in enumerate(passes):
-        writer = VideoWriter(folder / f"{name}.mp4", fps, options.size)
-        for index in range(count):
-            writer.add(np.asarray(Image.open(folder / name / f"{index:06d}.png")))
-            progress(number * count + index + 1, len(passes) * count)
-        writer.close()
+        with VideoWriter(folder / f"{name}.mp4", fps, options.size) as writer:
+            for index in range(count):
+                writer.add(np.asarray(Image.open(folder / name / f"{index:06d}.png")))
+                progress(number * count + index + 1, len(passes) * count)
     if options.check:
         files = [folder / "errors" / f"{index:06d}.json" for index in range(count)]
         frames = [json.loads(path.read_text(encoding="utf-8")) for path in files]
         worst = max(frame["max_error"] for frame in frames)
         value = {"max_error": worst, "worst_psnr": min(frame["psnr"] for frame in frames)}
-        (folder / "errors.json").write_text(
-            json.dumps(value | {"frames": frames}, indent=2) + "\n", encoding="utf-8"
-        )
+        text = json.dumps(value | {"frames": frames}, indent=2) + "\n"
+        write_atomically({folder / "errors.json": text.encode()})
         for path in files:
             path.unlink()
         (folder / "errors").rmdir()

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from jaxtyping import Bool, Float, Int
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from handavatar.edit import Edit, Paint
@@ -41,6 +41,7 @@ from handavatar.hand.parts import finer_rig
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.rig import RIG_ARRAYS, PosedHand, Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
+from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import find_not_finite, require_finite
 from handavatar.jobs.threads import mapped
 from handavatar.render.chart import charted
@@ -942,11 +943,8 @@ class HandAvatar(nn.Module):
         if self.edit.light is not None:
             about["edit"]["light"] = self.edit.light
         require_finite({**tensors, **about}, f"{path}: not saved")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside = path.with_name(path.name + ".tmp")
         stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-        save_file(stored, aside, {"handavatar": json.dumps(about)})
-        aside.replace(path)
+        write_atomically({path: save(stored, {"handavatar": json.dumps(about)})})
 
     @staticmethod
     def load(path: Path | str) -> "HandAvatar":

@@ -1,7 +1,6 @@
 """The embedded default: the whole road on the capture that ships, offline, on two cores."""
 
 import json
-import shutil
 import sys
 import time
 from dataclasses import dataclass
@@ -17,7 +16,14 @@ from handavatar.avatar import HandAvatar
 from handavatar.capture.default import default_capture
 from handavatar.edit import Edit, bones_named
 from handavatar.evaluate.run import EvaluateOptions, evaluate_run
-from handavatar.jobs.files import FolderInUse, FolderKind, claim_folder, refuse_folder_in_use
+from handavatar.jobs.files import (
+    FolderInUse,
+    FolderKind,
+    claim_folder,
+    refuse_folder_in_use,
+    write_aside,
+    write_atomically,
+)
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.train.loop import TrainOptions, train
 from handavatar.train.runs import RUN
@@ -88,12 +94,13 @@ def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
         ),
         stages["training"],
     )
-    shutil.copyfile(run / "avatar.safetensors", out / "avatar.safetensors")
+    _copy(run / "avatar.safetensors", out / "avatar.safetensors")
     _say("2/4 judging held-out poses", begin)
     metrics = evaluate_run(EvaluateOptions(run=run, device=options.device), stages["judging"])
-    shutil.copyfile(run / "evaluation" / "metrics.json", out / "metrics.json")
-    shutil.copyfile(run / "evaluation" / "report.html", out / "report.html")
-    Image.fromarray(overview(run / "evaluation")).save(out / "overview.png")
+    _copy(run / "evaluation" / "metrics.json", out / "metrics.json")
+    _copy(run / "evaluation" / "report.html", out / "report.html")
+    with write_aside(out / "overview.png") as aside:
+        Image.fromarray(overview(run / "evaluation")).save(aside)
     _say("3/4 a video of poses it never saw", begin)
     renders = _folder_of_pictures(run / "renders")
     render_motion(
@@ -107,18 +114,22 @@ def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
         ),
         stages["a video"],
     )
-    shutil.copyfile(renders / "rgb.mp4", out / "novel_poses.mp4")
+    _copy(renders / "rgb.mp4", out / "novel_poses.mp4")
     stages["edits"](0.0)
     _say("4/4 edits", begin)
-    Image.fromarray(edited_pictures(HandAvatar.load(out / "avatar.safetensors"))).save(
-        out / "edits.png"
-    )
+    with write_aside(out / "edits.png") as aside:
+        edits = edited_pictures(HandAvatar.load(out / "avatar.safetensors"))
+        Image.fromarray(edits).save(aside)
     _say(
         f"done: {metrics['paper']['psnr']:.1f} dB (paper's protocol), "
         f"mask IoU {metrics['mask_iou']:.3f}; open {out / 'report.html'}",
         begin,
     )
     return out
+
+
+def _copy(source: Path, target: Path) -> None:
+    write_atomically({target: source.read_bytes()})
 
 
 def _folder_of_pictures(renders: Path) -> Path:

@@ -13,6 +13,7 @@ from handavatar.avatar import HandAvatar
 from handavatar.capture.checks import CaptureError, decoded, open_picture
 from handavatar.edit import Edit, Paint, bones_named
 from handavatar.hand.rig import Rig
+from handavatar.jobs.files import refuse_file_in_use
 
 _UNSEEN_COLOR = (0.85, 0.1, 0.75)
 _UNSEEN_OPACITY = 0.7
@@ -96,12 +97,12 @@ def save_edited(options: EditOptions) -> Path:
 
     Raises:
         CheckpointError: if the avatar cannot be read.
-        CaptureError: if the picture of the paint cannot be read, or the file is there already.
+        CaptureError: if the picture of the paint cannot be read.
+        FolderInUse: if the file is there already.
         ValueError: what cannot be understood.
     """
     options.check_look()
-    if options.out.exists() and not (options.overwrite and options.out.is_file()):
-        raise CaptureError(f"{options.out} exists", "name another file, or use --overwrite")
+    refuse_file_in_use(options.out, options.overwrite)
     avatar = HandAvatar.load(options.run)
     avatar.edit = avatar.edit.then(options.edit_on(avatar))
     avatar.save(options.out)

@@ -13,6 +13,7 @@ from made_frames import (
     spoilt,
 )
 
+from handavatar.fit import solver
 from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
 from handavatar.fit.kinematics import NUM_UNKNOWNS
 from handavatar.fit.shape import ShapeSpace, fixed_shape
@@ -166,3 +167,17 @@ def test_a_true_shape_stays(rig: Rig, truth: HandPose, frames: list[Observation]
     assert 1000 * float((hand.rest_vertices - rig.template_vertices).norm(dim=-1).mean()) < 1.0
     apart = hand.posed(descent.poses).vertices - rig.shaped().posed(truth).vertices
     assert 1000 * float(apart.norm(dim=-1).mean()) < 1.6
+
+
+def test_of_very_many_frames_some_bands_are_made_again_and_nothing_changes(
+    rig: Rig, truth: HandPose, frames: list[Observation], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Memory is bounded; what is not kept has the same values."""
+    look, found = Look(0.7, 3.0), []
+    for room in (len(frames), 2):
+        monkeypatch.setattr(solver, "_MOST_BAND_BYTES", room * 4 * 4 * SIZE**2)
+        descent = _descent(rig.shaped(), frames, spoilt(truth, 6.0), 6.0)
+        descent.step_poses(look, 2)
+        assert len(descent._bands) == room
+        found.append(descent.poses.rotations)
+    assert torch.equal(*found)

@@ -10,6 +10,7 @@ from safetensors.torch import load_file, save_file
 from told import Told
 
 from handavatar.capture.checks import CaptureError
+from handavatar.jobs.files import FolderInUse
 from handavatar.jobs.finite import NotFinite, find_not_finite
 from handavatar.synthetic import lessons
 from handavatar.synthetic.lessons import TrackerTrainOptions, train_made_tracker
@@ -58,13 +59,15 @@ def test_a_training_makes_its_pictures_once_and_goes_on(
     torch.testing.assert_close(third.network.at_point, second.network.at_point, atol=1e-4, rtol=0)
     with pytest.raises(TrackerError, match="other points"):
         monkeypatch.setattr(lessons, "NUM_SKIN_POINTS", 3)
-        train_made_tracker(further)
+        train_made_tracker(replace(further, overwrite=True))
     monkeypatch.setattr(lessons, "NUM_SKIN_POINTS", 64)
     options.out.with_suffix(".state").write_bytes(b"nothing")
     with pytest.raises(CaptureError, match="cannot be gone on with"):
         train_made_tracker(replace(options, resume=True))
     made.write_bytes(b"nothing")
     with pytest.raises(CaptureError, match="cannot be read"):
+        train_made_tracker(replace(options, overwrite=True))
+    with pytest.raises(FolderInUse, match="exists"):
         train_made_tracker(options)
     assert torch.equal(read_tracker(options.out).network.at_point, second.network.at_point)
 

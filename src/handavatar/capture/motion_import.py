@@ -20,6 +20,7 @@ from handavatar.capture.tracking import has_mediapipe
 from handavatar.capture.video import VideoOptions, capture_video
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.files import refuse_file_in_use
 from handavatar.jobs.progress import SILENT, Progress
 
 _MOST_FPS = 240.0
@@ -58,6 +59,8 @@ class MotionFromOptions:
     """Of a file's camera; opengl has y up and z backwards."""
     focal: float | None = None
     """True focal length in pixels of the pictures that HaMeR or WiLoR saw, for their depths."""
+    overwrite: bool = False
+    """Replace a file at OUT."""
 
 
 def motion_from(
@@ -75,8 +78,10 @@ def motion_from(
     Raises:
         CaptureError: there is no hand in it, the poses have no times, or a file is not what it is
             said to be.
+        FolderInUse: there is a file at ``out`` already.
         LicensedRigMissing: a file cannot be read without the user's own MANO file.
     """
+    refuse_file_in_use(options.out, options.overwrite)
     if (options.source / "transforms.json").is_file():
         return motion_of_capture(read_capture(options.source), options.fps, tell)
     is_told = options.layout != "auto"

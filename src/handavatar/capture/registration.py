@@ -241,7 +241,5 @@ def poses_of(found: Registered) -> list[HandPose]:
 def observe_frame(frame: Frame) -> Observation:
     """What a frame of a capture shows, its picture binned if it is large."""
     frame = frame.binned(FITTED_SIDE)
-    picture = FramePicture.of(
-        frame.camera, frame.image.float() / 255, frame.alpha, frame.known, frame.gain
-    )
+    picture = FramePicture.of(frame.camera, frame.image, frame.alpha, frame.known, frame.gain)
     return Observation(picture, frame.time, frame.landmarks)

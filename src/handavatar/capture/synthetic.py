@@ -31,7 +31,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from PIL import Image
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from handavatar.capture.frames import (
@@ -480,9 +480,8 @@ def _write_subject(
         "plain_vertices": subject.plain_vertices,
         "shape_coefficients": subject.shape_coefficients,
     }
-    save_file(
-        {k: v.contiguous() for k, v in arrays.items()}, writer.file("truth/subject.safetensors")
-    )
+    subject_file = writer.file("truth/subject.safetensors")
+    subject_file.write_bytes(save({k: v.contiguous() for k, v in arrays.items()}))
     facts = {
         "schema": 1,
         "options": asdict(options),

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.clip_gains import match_clips
@@ -244,7 +244,7 @@ def capture_video(
         save_json(writer.file("skipped.json"), skipped(tried))
         about = agreement(tried) | {"summary": summary(tried, frames, seen)}
         save_json(writer.file("fit.json"), about)
-        save_file({"counts": seen.counts.int()}, writer.file("seen.safetensors"))
+        writer.file("seen.safetensors").write_bytes(save({"counts": seen.counts.int()}))
         overview(tried, writer.file("overview.png"))
     return read_capture(options.out)
 

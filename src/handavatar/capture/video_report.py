@@ -17,7 +17,7 @@ from handavatar.capture.left_out import CAUSES, LeftOut
 from handavatar.capture.overview import Tile, contact_sheet, outlined
 from handavatar.capture.seen_skin import SeenSkin
 from handavatar.capture.tracking import DARK, NO_HAND, Track
-from handavatar.jobs.files import FolderKind, mark_folder
+from handavatar.jobs.files import FolderKind, mark_folder, write_atomically
 
 _HELD_OUT = ((0.28, 0.08), (0.68, 0.08))
 # Of the mesh: as much of it beyond the picture is contact with the border.
@@ -319,4 +319,4 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
 
 def save_json(path: Path, content: object) -> None:
     """Writes JSON that people may read."""
-    path.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
+    write_atomically({path: json.dumps(content, indent=1, allow_nan=False).encode()})

@@ -84,9 +84,9 @@ _TABLES: dict[str, Callable[[], _Bench]] = {
 
 def bench(words: list[str], progress: Progress) -> int:
     """Measure a table: ``bench --table ablation|geometry|...``, or one of the other names."""
-    from handavatar.cli.arguments import JSON, Extra, parse_with, print_json
+    from handavatar.cli.arguments import JSON, OVERWRITE, Extra, parse_with, print_json
     from handavatar.cli.inputs import AVATAR, CAPTURE
-    from handavatar.jobs.files import write_atomically
+    from handavatar.jobs.files import refuse_file_in_use, write_atomically
 
     name = _named_table(words)
     if name not in _TABLES:
@@ -102,11 +102,14 @@ def bench(words: list[str], progress: Progress) -> int:
         Extra("table", str, f"which table: {', '.join(_TABLES)}"),
         Extra("out", Path | None, "Markdown file to write as well", None),
         JSON,
+        OVERWRITE,
     )
     inputs = {"capture": CAPTURE, "captures": CAPTURE, "avatar": AVATAR, "avatars": AVATAR}
     own = {field.name for field in fields(chosen.options)}
     reads = {field: expected for field, expected in inputs.items() if field in own}
     options, extras = parse_with(chosen.options, extras_wanted, words, "bench", reads=reads)
+    if extras["out"] is not None:
+        refuse_file_in_use(extras["out"], extras["overwrite"])
     with progress:
         table = chosen.make(options, progress)
     if extras["out"] is not None:

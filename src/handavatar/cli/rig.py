@@ -105,7 +105,14 @@ def refine(words: list[str], progress: Progress) -> int:
     import json
     from dataclasses import asdict
 
-    from handavatar.cli.arguments import JSON, Extra, parse_with, print_figures, print_json
+    from handavatar.cli.arguments import (
+        JSON,
+        OVERWRITE,
+        Extra,
+        parse_with,
+        print_figures,
+        print_json,
+    )
     from handavatar.evaluate.skin_table import evaluation_poses, measure_skin
     from handavatar.hand.open_hand import Level, load_open_hand
     from handavatar.hand.skin_refinement import (
@@ -115,6 +122,7 @@ def refine(words: list[str], progress: Progress) -> int:
         refine_skin,
     )
     from handavatar.hand.sparse_skin import SparseSkin
+    from handavatar.jobs.files import refuse_file_in_use
 
     extras_wanted = (
         Extra("out", Path, "file to write (safetensors)", Path("skin.safetensors")),
@@ -122,12 +130,15 @@ def refine(words: list[str], progress: Progress) -> int:
         Extra("rounds", int, "midpoint subdivisions", 2),
         Extra("resume", bool, "continue from OUT.part, which a stopped run has left", False),
         JSON,
+        OVERWRITE,
     )
     options, extras = parse_with(RefinementOptions, extras_wanted, words, "rig refine")
     out: Path = extras["out"]
     base = load_open_hand(extras["level"])
     problem = SkinRefinement.of(base, extras["rounds"], options)
     part = out.with_name(out.name + ".part")
+    refuse_file_in_use(out, extras["overwrite"])
+    refuse_file_in_use(part, extras["overwrite"] or extras["resume"])
     is_continued = extras["resume"] and part.is_file()
     state = RefinementState.load(part, problem) if is_continued else problem.begin()
     progress.skip(state.step, problem.total_steps)

@@ -49,7 +49,7 @@ from handavatar.evaluate.report import (
 from handavatar.evaluate.unseen import unseen_figures, unseen_pictures
 from handavatar.fit.register import RegisterOptions
 from handavatar.hand.pose import HandPose
-from handavatar.jobs.files import FolderKind, claim_folder
+from handavatar.jobs.files import FolderKind, fill_folder, refuse_folder_in_use, write_atomically
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.video_writer import VideoWriter
 
@@ -138,7 +138,8 @@ def evaluate_run(options: EvaluateOptions, progress: Progress = SILENT) -> dict[
             f"lights {', '.join(map(str, range(avatar.num_lights)))}",
             "judge an avatar that was trained on these clips",
         )
-    claim_folder(out, EVALUATION)
+    inputs = (options.run, capture.folder)
+    refuse_folder_in_use(out, EVALUATION, True, inputs)
     count, is_tracked = len(indices), capture.is_tracked
     stages = progress.stages(
         {
@@ -157,7 +158,8 @@ def evaluate_run(options: EvaluateOptions, progress: Progress = SILENT) -> dict[
     stages["measuring"](0.0)
     metrics = _measured(options, capture, avatar, frames, protocols)
     stages["report"](0.0)
-    _write(out, metrics, avatar, capture, frames, protocols, options)
+    with fill_folder(out, EVALUATION, True, inputs) as folder:
+        _write(folder, metrics, avatar, capture, frames, protocols, options)
     return metrics
 
 
@@ -491,7 +493,7 @@ def _write(
     Image.fromarray(contact_sheet(rows, _SHEET)).save(out / "sheet.png")
     if capture.is_tracked:
         _film(out / "own_motion.mp4", capture, frames, main)
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=2))
+    write_atomically({out / "metrics.json": json.dumps(metrics, indent=2).encode()})
     figures = {key: value for key, value in metrics.items() if key not in ("notes", "protocols")}
     figures |= {f"protocol_{key}": value for key, value in metrics["protocols"].items()}
     for key in (*_OUTSIDE, "protocol"):
@@ -547,15 +549,15 @@ def _film(path: Path, capture: Capture, frames: list[Frame], protocol: _Protocol
     steps = steps[steps > 0]
     fps = 1 / float(steps.median()) if len(steps) else 1.0
     side = frames[0].camera.width
-    writer = VideoWriter(path, min(max(fps, 1.0), 60.0), frames[0].camera.height, 2 * side)
-    for place in order:
-        frame = frames[place]
-        shown = [frame.image.numpy(), picture(protocol.judged[place].rendered)]
-        shown = [greyed(pixels, frame.known) for pixels in shown]
-        if capture.side == "left":
-            shown = [pixels[:, ::-1] for pixels in shown]
-        writer.add(np.concatenate(shown, axis=1))
-    writer.close()
+    fps = min(max(fps, 1.0), 60.0)
+    with VideoWriter(path, fps, frames[0].camera.height, 2 * side) as writer:
+        for place in order:
+            frame = frames[place]
+            shown = [frame.image.numpy(), picture(protocol.judged[place].rendered)]
+            shown = [greyed(pixels, frame.known) for pixels in shown]
+            if capture.side == "left":
+                shown = [pixels[:, ::-1] for pixels in shown]
+            writer.add(np.concatenate(shown, axis=1))
 
 
 def _curves(run: Path) -> list[Curve]:

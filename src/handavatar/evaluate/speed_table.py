@@ -6,7 +6,6 @@ same for every ray, so it is timed on some rays of each picture, drawn at random
 
 import math
 import multiprocessing
-import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -392,6 +391,10 @@ def most_memory(device: torch.device) -> float:
         # Not `ru_maxrss`: a process that another one starts inherits the other's peak there.
         status = Path("/proc/self/status").read_text()
         return int(status.partition("VmHWM:")[2].split()[0]) * 1024 / 1e6
+    if sys.platform == "win32":
+        raise OSError("Windows does not tell how much memory a process has held at most")
+    import resource
+
     # Told in kilobytes, but in bytes on a Mac.
     unit = 1e6 if sys.platform == "darwin" else 1e3
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

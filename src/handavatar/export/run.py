@@ -26,6 +26,7 @@ from handavatar.jobs.files import (
     FolderKind,
     UnfinishedFolder,
     files_named,
+    refuse_file_in_use,
     refuse_folder_in_use,
     write_atomically,
 )
@@ -80,8 +81,9 @@ def export_avatar(options: ExportOptions, progress: Progress = SILENT) -> Path:
     Raises:
         CheckpointError: if the avatar cannot be read.
         CaptureError: if the motion or the paint cannot be read, or there is no such gesture.
-        ValueError: for options that contradict each other, or a file that is there already.
-        FolderInUse: if the folder of a page holds something that may not be replaced.
+        ValueError: for options that contradict each other.
+        FolderInUse: if a file is there already, or the folder of a page holds something that may
+            not be replaced.
     """
     options.check_look()
     _check(options)
@@ -118,8 +120,7 @@ def _check(options: ExportOptions) -> None:
     if options.format != "glb" and options.motion is not None:
         raise ValueError(f"--motion: {options.format.upper()} cannot move; choose glb, or --pose")
     for path in _files(options):
-        if path.exists() and not (options.overwrite and path.is_file()):
-            raise ValueError(f"--out: {path} exists; name another file, or add --overwrite")
+        refuse_file_in_use(path, options.overwrite)
 
 
 def _inputs(options: ExportOptions) -> list[Path]:

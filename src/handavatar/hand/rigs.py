@@ -14,6 +14,7 @@ from safetensors import torch as safetensors_torch
 from handavatar.hand.mano import LICENCE, WHERE_TO_GET_IT, ManoModel, read_mano
 from handavatar.hand.open_hand import Level, load_open_hand
 from handavatar.hand.rig import RIG_ARRAYS, LicensedRigMissing, Rig, RigError
+from handavatar.jobs.files import refuse_file_in_use, write_atomically
 
 SCHEMA = 1
 _MAX_BYTES = 64 * 2**20
@@ -39,14 +40,13 @@ def save_rig(model: ManoModel, path: Path | None = None, overwrite: bool = False
         The file.
 
     Raises:
-        RigError: there is a file at ``path`` already.
+        FolderInUse: there is a file at ``path`` already.
     """
     rig = model.rig
     if path is None:
         path = rigs_folder() / f"{rig.name}-{rig.sha256[:12]}.safetensors"
         overwrite = True  # Its name says that it holds the same.
-    if path.exists() and not (overwrite and path.is_file()):
-        raise RigError(f"{path}: exists already\nname another file, or add --overwrite")
+    refuse_file_in_use(path, overwrite)
     tensors = {name: getattr(rig, name).contiguous() for name in _TENSORS}
     tensors |= {_SET_PREFIX + name: members for name, members in rig.vertex_sets.items()}
     tensors |= {"hands_mean": model.hands_mean, "hands_components": model.hands_components}
@@ -59,13 +59,7 @@ def save_rig(model: ManoModel, path: Path | None = None, overwrite: bool = False
         "licence": LICENCE,
         "source_sha256": model.sha256,
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".tmp-{os.getpid()}-{path.name}")
-    try:
-        safetensors_torch.save_file(tensors, aside, facts)
-        aside.replace(path)
-    finally:
-        aside.unlink(missing_ok=True)
+    write_atomically({path: safetensors_torch.save(tensors, facts)})
     return path
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from jaxtyping import Bool, Float, Int
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from handavatar.geometry.closest import closest_on_mesh
@@ -28,6 +28,7 @@ from handavatar.hand.pose import FINGER_BONES, bone_transforms
 from handavatar.hand.pose_sampling import sample_poses
 from handavatar.hand.rig import Rig, RigError
 from handavatar.hand.sparse_skin import MAX_BONES
+from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import require_finite
 
 SHARPNESS = 100.0
@@ -107,10 +108,8 @@ class RefinementState:
         require_finite(vars(self), f"{path}: not saved", _BEGIN_ANEW)
         # A tensor that is two of the fields at once is stored twice.
         tensors = {name: value.clone() for name, value in vars(self).items() if name != "step"}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside = path.with_name(path.name + ".tmp")
-        save_file(tensors, aside, {"step": str(self.step), "problem": problem.fingerprint})
-        aside.replace(path)
+        facts = {"step": str(self.step), "problem": problem.fingerprint}
+        write_atomically({path: save(tensors, facts)})
 
     @staticmethod
     def load(path: Path, problem: "SkinRefinement") -> "RefinementState":

@@ -5,6 +5,8 @@ operations on such pieces too finely to gain anything. Pieces are independent, s
 not depend on the number of threads.
 """
 
+import os
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,6 +20,16 @@ from handavatar.jobs.signals import heed, heeds, stop_point
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
+
+
+def step_back(steps: int) -> None:
+    """Leaves the cores to other threads, on Linux: elsewhere a priority is the whole process's.
+
+    Args:
+        steps: of the thread's priority, as of ``nice``; each adds to the last.
+    """
+    if sys.platform == "linux":
+        os.nice(steps)
 
 
 def mapped(

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from safetensors.torch import save_file
+from safetensors.torch import save
 from scipy import ndimage
 from torch import Tensor
 
@@ -37,6 +37,7 @@ from handavatar.hand.pose_sampling import (
 )
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.files import write_atomically
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.video_writer import VideoWriter
 from handavatar.render.rasterize import rasterize_projected
@@ -210,14 +211,20 @@ def make_film(options: FilmOptions, folder: Path, progress: Progress = SILENT) -
     base = load_rig(options.rig)
     stage = _Stage(options, base)
     masks = []
-    # The video last: who finds it finds the truth as well.
-    aside = folder / f".{options.name}.part.mp4"
-    with VideoWriter(aside, options.fps, options.height, options.width, options.crf) as recorder:
+    with VideoWriter(path, options.fps, options.height, options.width, options.crf) as recorder:
         for frame in range(options.num_frames):
             picture, mask = stage.frame(frame)
             recorder.add(picture)
             masks.append(mask)
             progress(frame + 1, options.num_frames)
+        # The video is there last: who finds it finds the truth as well.
+        _write_truth(path, options, base, stage, masks)
+    return path
+
+
+def _write_truth(
+    path: Path, options: FilmOptions, base: Rig, stage: "_Stage", masks: list[np.ndarray]
+) -> None:
     data, ends = encoded_masks(masks)
     arrays = {
         "rotations": stage.motion.rotations,
@@ -229,7 +236,6 @@ def make_film(options: FilmOptions, folder: Path, progress: Progress = SILENT) -
         "mask_bytes": data,
         "mask_ends": ends,
     }
-    save_file({k: v.contiguous() for k, v in arrays.items()}, path.with_suffix(".safetensors"))
     facts = {
         "schema": SCHEMA,
         "rig_name": base.name,
@@ -240,9 +246,12 @@ def make_film(options: FilmOptions, folder: Path, progress: Progress = SILENT) -
         "fps": options.fps,
         "options": asdict(options),
     }
-    path.with_suffix(".json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
-    aside.replace(path)
-    return path
+    write_atomically(
+        {
+            path.with_suffix(".safetensors"): save({k: v.contiguous() for k, v in arrays.items()}),
+            path.with_suffix(".json"): json.dumps(facts, indent=1).encode(),
+        }
+    )
 
 
 def natural_motion(rig: Rig, options: FilmOptions) -> Motion:

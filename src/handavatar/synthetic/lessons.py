@@ -16,7 +16,7 @@ from torch import Tensor
 
 from handavatar.capture.checks import CaptureError
 from handavatar.hand.rigs import load_rig
-from handavatar.jobs.files import write_atomically
+from handavatar.jobs.files import refuse_file_in_use, write_atomically
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.signals import is_stopping, unbroken
@@ -75,6 +75,8 @@ class TrackerTrainOptions:
     """learning rate at its highest"""
     resume: bool = False
     """go on where a training of this file ended, or was ended"""
+    overwrite: bool = False
+    """replace a file at OUT, and what a training of it has left"""
 
 
 @dataclass(frozen=True)
@@ -97,11 +99,14 @@ def train_made_tracker(options: TrackerTrainOptions, progress: Progress = SILENT
     Raises:
         Interrupted: the command was told to stop; ``resume`` goes on with the state that it left.
         CaptureError: nothing to go on with, or a damaged file.
+        FolderInUse: there is a file at ``out`` already.
         NotFinite: the loss, a weight or the optimiser's state is no longer finite; it names what,
             in which step, and how to go on.
         TrackerError: the file to start from is no tracker, or one of other points.
     """
     state_file = options.out.with_suffix(".state")
+    for path in (options.out, state_file):
+        refuse_file_in_use(path, options.overwrite or options.resume)
     if options.resume and not state_file.is_file():
         raise CaptureError(
             f"{state_file}: there is nothing to go on with", "train without --resume"

@@ -29,7 +29,7 @@ from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
-from handavatar.jobs.files import make_folder
+from handavatar.jobs.files import make_folder, write_aside
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.train.attention import attention_figures, attention_picture, read_attention
 from handavatar.train.kept import commit_notes, present_commit
@@ -421,7 +421,8 @@ def _attention(field: PartwiseOccupancy, options: ComparisonOptions) -> dict[str
             "preference_untrained": _mean_preference(attention_figures(control)),
             "parts": by_part,
         }
-    attention_picture(readings).save(options.priors / "attention.png")
+    with write_aside(options.priors / "attention.png") as aside:
+        attention_picture(readings).save(aside)
     return {"picture": "attention.png", **figures}
 
 

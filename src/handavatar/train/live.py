@@ -26,6 +26,7 @@ from safetensors import SafetensorError
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
+from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import NotFinite
 from handavatar.jobs.progress import Progress
 from handavatar.train.corrections import PoseCorrections
@@ -245,9 +246,8 @@ class _Live:
         state |= {"phase": phase, "figures": figures}
         state |= {"process": os.getpid(), "host": socket.gethostname(), "time": time.time()}
         path = live_folder(self._run) / "progress.json"
-        aside = path.with_name(f".tmp-{os.getpid()}-progress.json")
-        aside.write_text(json.dumps(state, allow_nan=False), encoding="utf-8")
-        aside.replace(path)
+        # Written anew all the time: after a crash of the machine nobody misses it.
+        write_atomically({path: json.dumps(state, allow_nan=False).encode()}, is_durable=False)
 
     def _show(self) -> None:
         live: dict[str, Any] = {"job": self._last["job"], "step": self._last["step"]}

@@ -18,7 +18,7 @@ from typing import Any, get_args
 import torch
 from jaxtyping import Float
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
@@ -30,6 +30,7 @@ from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.files import is_empty, refuse_file_in_use, write_atomically
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.signals import Interrupted, heard_signals, is_stopping, unbroken
@@ -95,6 +96,7 @@ class PriorOptions:
         folder: for the log and checkpoints; what was begun there is continued.
         checkpoint_every: steps between two writings.
         device: where the networks run.
+        overwrite: replace a file at ``out``; what was begun in ``folder`` does so anyway.
     """
 
     out: Path = Path("prior.safetensors")
@@ -113,6 +115,7 @@ class PriorOptions:
     folder: Path | None = None
     checkpoint_every: int = 1000
     device: str = "cpu"
+    overwrite: bool = False
 
 
 def train_prior(options: PriorOptions, progress: Progress = SILENT) -> OccupancyField:
@@ -129,6 +132,7 @@ def train_prior(options: PriorOptions, progress: Progress = SILENT) -> Occupancy
 
     Raises:
         CheckpointError: if ``folder`` holds something else than a run with these options.
+        FolderInUse: if there is a file at ``out`` already.
         NotFinite: if a loss, a weight or an optimiser's state is no longer finite; it names what,
             in which step, and how to go on.
         Interrupted: after SIGINT or SIGTERM; a checkpoint was saved if there is a ``folder``.
@@ -141,6 +145,8 @@ def train_prior(options: PriorOptions, progress: Progress = SILENT) -> Occupancy
             f"prior: found {options.joint_points} points at joints for the decoder "
             f"{options.decoder!r}; only 'pair' answers for two parts at once"
         )
+    is_begun = options.folder is not None and not is_empty(options.folder)
+    refuse_file_in_use(options.out, options.overwrite or is_begun)
     base = load_rig(options.rig, options.level)
     with joined_processes(options.device) as processes, heard_signals():
         if options.poses % processes.count:
@@ -291,11 +297,8 @@ def save_prior(field: OccupancyField, options: PriorOptions, rig: Rig, step: int
         "step": str(step),
         "options": json.dumps(record),
     }
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    aside = options.out.with_suffix(".tmp")
     state = {name: value.detach().cpu().contiguous() for name, value in field.state_dict().items()}
-    save_file(state, aside, metadata)
-    aside.replace(options.out)
+    write_atomically({options.out: save(state, metadata)})
 
 
 def load_prior(

@@ -22,7 +22,7 @@ from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
 from handavatar.hand.rigs import load_rig
 from handavatar.hand.surface import extract_hand
-from handavatar.jobs.files import FolderKind, claim_folder
+from handavatar.jobs.files import FolderKind, claim_folder, write_aside
 from handavatar.render.shaded import shaded_mesh
 from handavatar.train.prior import SHIPPED_PRIOR, open_prior
 
@@ -107,7 +107,8 @@ def picture_priors(options: PriorPictureOptions) -> list[Path]:
             surface = extract_hand(field_of(hand), boxes, hand, options.resolution)
             meshes[name] = (surface.vertices, surface.faces)
         path = options.out / f"{pose}.png"
-        Image.fromarray(side_by_side(meshes, hand.vertices, options.size)).save(path)
+        with write_aside(path) as aside:
+            Image.fromarray(side_by_side(meshes, hand.vertices, options.size)).save(aside)
         written.append(path)
     return written
 

@@ -23,7 +23,6 @@ import re
 import shutil
 import socket
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -39,13 +38,12 @@ from torch import Tensor
 from handavatar.avatar import CheckpointError
 from handavatar.jobs.files import (
     MARKER,
-    FolderInUse,
     FolderKind,
     is_empty,
     mark_folder,
+    put_in_place,
     read_marker,
-    refuse_folder_in_use,
-    swap_folder,
+    write_atomically,
 )
 from handavatar.jobs.finite import find_not_finite, require_finite
 from handavatar.train.provenance import package_versions, source_commit
@@ -58,7 +56,6 @@ _MANIFEST = "MANIFEST.json"
 _STATE = "state.json"
 _STEP_FOLDER = re.compile(r"step-(\d{9,})")
 _FILE_NAME = re.compile(r"[a-z][a-z0-9_]*\.(safetensors|json)")
-_ENDINGS = ("safetensors", "json")
 _MAX_MANIFEST_BYTES = 1 << 20
 
 _log = logging.getLogger(__name__)
@@ -75,18 +72,8 @@ def _is_older_run(folder: Path) -> bool:
 
 UNFINISHED_STAGES = ("geometry.unfinished", "samples.unfinished", "detail.unfinished")
 """Files of a run, without their endings, in which stages between checkpoints keep their state."""
-RUN = FolderKind(
-    "run",
-    (
-        *("options.json", "run.json", "seeds.json", "log.jsonl", "avatar.safetensors", ".lock"),
-        *(f"{kept}/step-*/*.{end}" for kept in ("checkpoints", "corrupt") for end in _ENDINGS),
-        *(f"{name}{end}.safetensors" for name in UNFINISHED_STAGES for end in ("", ".stage")),
-        *(f"live/{name}" for name in ("avatar.safetensors", "progress.json", "watched")),
-        *(f"evaluation/{name}" for name in (MARKER, "*.png", "metrics.json", "report.html")),
-    ),
-    _is_older_run,
-)
-"""The folder that :func:`create_run` makes. What was rendered into it is not listed: it stays."""
+RUN = FolderKind("run", is_older=_is_older_run)
+"""The folder that :func:`create_run` makes."""
 
 
 @dataclass(frozen=True)
@@ -199,7 +186,6 @@ def create_run(
     capture: Path,
     capture_sha256: str,
     perceptual: str,
-    overwrite: bool = False,
 ) -> Run:
     """Makes the folder with ``options.json`` and ``run.json``.
 
@@ -210,8 +196,6 @@ def create_run(
         capture: folder of the capture.
         capture_sha256: fingerprint of the capture's files.
         perceptual: the perceptual loss in use, ``lpips-vgg`` or the substitute's name.
-        overwrite: replace the run that lies there, unless it is being trained or holds files that
-            no training writes; a folder that is no run is never touched.
 
     Raises:
         CheckpointError: if the folder holds something already.
@@ -226,39 +210,18 @@ def create_run(
         "perceptual": perceptual,
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
     }
-    try:
-        if is_empty(folder) or is_unfinished_start(folder):
-            _write_start(folder, options, facts)
-        elif overwrite and (folder / "run.json").is_file():
-            _replace_run(folder, options, facts, capture)
-        else:
-            raise FolderInUse(f"{folder}: not empty", "")
-    except FolderInUse as error:
+    if not is_empty(folder) and not is_unfinished_start(folder):
         raise CheckpointError(
-            f"{error.found}, expected a new folder\n"
+            f"{folder}: not empty, expected a new folder\n"
             "name another with --out, or continue the run that is there with --resume auto"
-        ) from error
-    return Run(folder)
-
-
-def _write_start(folder: Path, options: Json, facts: Json) -> None:
+        )
+    run = Run(folder)
     folder.mkdir(parents=True, exist_ok=True)
     mark_folder(folder, RUN)
-    Run(folder).checkpoints.mkdir(exist_ok=True)
+    run.checkpoints.mkdir(exist_ok=True)
     write_json(folder / "options.json", options)
     write_json(folder / "run.json", facts)
-
-
-def _replace_run(folder: Path, options: Json, facts: Json, capture: Path) -> None:
-    """Puts the start of a run in the place of another one, which nobody may be training."""
-    refuse_folder_in_use(folder, RUN, True, (capture,))
-    with tempfile.TemporaryDirectory(
-        prefix=f".{folder.name}.", suffix=".part", dir=folder.absolute().parent
-    ) as beside:
-        whole = Path(beside) / folder.name
-        _write_start(whole, options, facts)
-        with locked(Run(folder)):
-            swap_folder(whole, folder, RUN, True, (capture,))
+    return run
 
 
 def is_unfinished_start(folder: Path) -> bool:
@@ -317,12 +280,7 @@ def locked(run: Run) -> Iterator[None]:
 def write_json(path: Path, value: Json) -> None:
     """Replaces a JSON file in one step; NaN is refused."""
     text = json.dumps(value, indent=2, allow_nan=False) + "\n"
-    aside = path.with_name(f".tmp-{os.getpid()}-{path.name}")
-    try:
-        _write_synced(aside, text.encode())
-        aside.replace(path)
-    finally:
-        aside.unlink(missing_ok=True)
+    write_atomically({path: text.encode()})
 
 
 # --- the log --------------------------------------------------------------------------------------
@@ -343,12 +301,7 @@ def read_log(run: Run) -> list[Json]:
 def truncate_log(run: Run, step: int) -> None:
     """Forgets what was logged after ``step``, so that a resumed log equals an uninterrupted one."""
     kept = b"".join(line for line, record in _log_lines(run) if record["step"] <= step)
-    aside = run.log.with_name(f".tmp-{os.getpid()}-log.jsonl")
-    try:
-        _write_synced(aside, kept)
-        aside.replace(run.log)
-    finally:
-        aside.unlink(missing_ok=True)
+    write_atomically({run.log: kept})
 
 
 def _log_lines(run: Run) -> Iterator[tuple[bytes, Json]]:
@@ -410,13 +363,9 @@ def save_checkpoint(
     try:
         aside.mkdir()
         for name, data in payloads.items():
-            _write_synced(aside / name, data)
-        _write_synced(aside / _MANIFEST, manifest)
-        _sync_folder(aside)
-        if final.exists():
-            final.rename(run.checkpoints / f".tmp-{os.getpid()}-{step}-replaced")
-        aside.rename(final)
-        _sync_folder(run.checkpoints)
+            (aside / name).write_bytes(data)
+        (aside / _MANIFEST).write_bytes(manifest)
+        put_in_place(aside, final)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
     _remove_leftovers(run)
@@ -544,21 +493,6 @@ def _require_free_space(folder: Path, num_bytes: int) -> None:
         raise OSError(
             errno.ENOSPC, f"a checkpoint needs {num_bytes} bytes free, found {free}", str(folder)
         )
-
-
-def _write_synced(path: Path, data: bytes) -> None:
-    with open(path, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def read_json(path: Path, remedy: str) -> Json:

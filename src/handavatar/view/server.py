@@ -22,6 +22,7 @@ from handavatar.avatar import HandAvatar, RenderSettings, chosen_device
 from handavatar.capture.motion import MOTIONS, Motion, read_motion
 from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.jobs.signals import awaited_signals
+from handavatar.jobs.threads import step_back
 from handavatar.train.live import read_live
 from handavatar.train.runs import Run
 from handavatar.view.answers import AvatarAnswers
@@ -107,7 +108,7 @@ class PageServer:
         """Stops answering and frees the port."""
         self._http.shutdown()
         self._http.server_close()
-        self._http.hang_up()
+        self._http.connections.end_all()
 
 
 Served = TypeVar("Served", bound=PageServer)
@@ -165,9 +166,9 @@ class ViewServer(PageServer):
 
 
 def _step_back() -> None:
-    """Leaves the cores to others, in a lane's thread: a priority is a thread's own on Linux."""
+    """Leaves the cores to others, in a lane's thread."""
     torch.set_num_threads(1)
-    os.nice(_LOW_PRIORITY)
+    step_back(_LOW_PRIORITY)
 
 
 def _end(turns: Turns, films: Films | None) -> None:
