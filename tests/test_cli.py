@@ -20,6 +20,7 @@ from handavatar.errors import ArgumentError
 from handavatar.hand.rig import LicensedRigMissing, RigError
 from handavatar.jobs.files import FolderInUse
 from handavatar.jobs.finite import NotFinite
+from handavatar.jobs.progress import Progress
 
 
 def test_help_lists_every_command_and_answers_quickly() -> None:
@@ -105,7 +106,7 @@ def test_errors_become_exit_codes_and_a_few_lines(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def fail(words: list[str]) -> int:
+    def fail(words: list[str], progress: Progress) -> int:
         """Fails."""
         raise error
 

@@ -61,6 +61,8 @@ AT_LEAST = {
     "capture.view": "start_of",
     "capture.video": "VideoOptions capture_video",
     "capture.synthetic": "SynthOptions make_capture",
+    "jobs.progress": "Progress Progress.stages Progress.skip shown_progress",
+    "jobs.signals": "Interrupted heard_signals stop_point",
     "train.loop": "TrainOptions train",
     "train.prior": "PriorOptions train_prior PriorEvaluationOptions evaluate_prior open_prior",
     "hand.pose_sampling": (

@@ -36,6 +36,7 @@ from handavatar.jobs.files import (
     refuse_folder_in_use,
     write_atomically,
 )
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.video_writer import VideoWriter
 from handavatar.processes import joined_processes
 from handavatar.retouch import Look
@@ -101,8 +102,12 @@ class RenderOptions(Look):
         )
 
 
-def render_motion(options: RenderOptions) -> Path:
+def render_motion(options: RenderOptions, progress: Progress = SILENT) -> Path:
     """Renders a motion: one PNG per frame and pass, and one video per pass.
+
+    Args:
+        options: what to render.
+        progress: told the frames done.
 
     Returns:
         The folder.
@@ -149,11 +154,16 @@ def render_motion(options: RenderOptions) -> Path:
             if processes.is_first:
                 folder.begin(options.overwrite)
             processes.wait()
+            frames, videos = progress.stages(
+                {"frames": 1.0 * len(poses), "videos": 0.03 * len(poses) * len(passes)}
+            ).values()
             for index in range(processes.rank, len(poses), processes.count):
                 files = [f"{name}/{index:06d}.png" for name in passes]
                 files += [f"errors/{index:06d}.json"] * (options.check > 0)
                 if folder.has(files):
+                    frames.skip(index + 1, len(poses))
                     continue
+                frames(index, len(poses))
                 pose, view = poses[index], views[index]
                 rendering = avatar.render(pose, view, edit, settings)
                 pictures = pass_pictures(rendering, avatar.info.get("side", "right"))
@@ -169,7 +179,7 @@ def render_motion(options: RenderOptions) -> Path:
             raise
         if processes.is_first:
             fps = motion.fps * len(poses) / len(motion)
-            _join_frames(folder.path, passes, len(poses), fps, options)
+            _join_frames(folder.path, passes, len(poses), fps, options, videos)
             folder.finish()
         processes.wait()
     return options.out
@@ -244,13 +254,19 @@ def _what_frames_depend_on(
 
 
 def _join_frames(
-    folder: Path, passes: tuple[str, ...], count: int, fps: float, options: RenderOptions
+    folder: Path,
+    passes: tuple[str, ...],
+    count: int,
+    fps: float,
+    options: RenderOptions,
+    progress: Progress,
 ) -> None:
     """Makes the videos, and one file of the frames' errors, from what all processes wrote."""
-    for name in passes:
+    for number, name in enumerate(passes):
         with VideoWriter(folder / f"{name}.mp4", fps, options.size) as writer:
             for index in range(count):
                 writer.add(np.asarray(Image.open(folder / name / f"{index:06d}.png")))
+                progress(number * count + index + 1, len(passes) * count)
     if options.check:
         files = [folder / "errors" / f"{index:06d}.json" for index in range(count)]
         frames = [json.loads(path.read_text(encoding="utf-8")) for path in files]

@@ -25,6 +25,7 @@ from handavatar.jobs.files import (
     write_aside,
     write_atomically,
 )
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.train.loop import TrainOptions, train
 from handavatar.train.runs import RUN
 
@@ -63,8 +64,12 @@ class DemoOptions:
         require_ranges(self, steps=(1, 10**8), frames=(1, 10_000), size=(2, 4096), seed=SEEDS)
 
 
-def run_demo(options: DemoOptions) -> Path:
+def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
     """Trains on the shipped capture, judges held-out poses, renders new ones, edits one.
+
+    Args:
+        options: where to, how much.
+        progress: told how far the whole demonstration is.
 
     Leaves ``avatar.safetensors``, ``metrics.json``, ``report.html``, ``overview.png``,
     ``novel_poses.mp4``, ``edits.png`` and the run itself in ``options.out``.
@@ -79,6 +84,10 @@ def run_demo(options: DemoOptions) -> Path:
     run = out / "run"
     claim_folder(out, DEMONSTRATION)
     begin = time.monotonic()
+    frames = float(options.frames)
+    stages = progress.stages(
+        {"training": 300.0, "judging": 40.0, "a video": 1.0 * frames, "edits": 5.0}
+    )
     _say("1/4 training on the shipped capture", begin)
     train(
         TrainOptions(
@@ -87,11 +96,12 @@ def run_demo(options: DemoOptions) -> Path:
             steps=options.steps,
             device=options.device,
             seed=options.seed,
-        )
+        ),
+        stages["training"],
     )
     _copy(run / "avatar.safetensors", out / "avatar.safetensors")
     _say("2/4 judging held-out poses", begin)
-    metrics = evaluate_run(EvaluateOptions(run=run, device=options.device))
+    metrics = evaluate_run(EvaluateOptions(run=run, device=options.device), stages["judging"])
     _copy(run / "evaluation" / "metrics.json", out / "metrics.json")
     _copy(run / "evaluation" / "report.html", out / "report.html")
     with write_aside(out / "overview.png") as aside:
@@ -106,9 +116,11 @@ def run_demo(options: DemoOptions) -> Path:
             frames=options.frames,
             overwrite=True,
             device=options.device,
-        )
+        ),
+        stages["a video"],
     )
     _copy(renders / "rgb.mp4", out / "novel_poses.mp4")
+    stages["edits"](0.0)
     _say("4/4 edits", begin)
     with write_aside(out / "edits.png") as aside:
         edits = edited_pictures(HandAvatar.load(out / "avatar.safetensors"))

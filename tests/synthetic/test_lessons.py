@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from told import Told
 
 from handavatar.capture.checks import CaptureError
 from handavatar.jobs.files import FolderInUse
@@ -30,21 +31,23 @@ def test_a_training_makes_its_pictures_once_and_goes_on(
 ) -> None:
     # In this process: a spawned one would not know of the smaller files.
     monkeypatch.setattr(lessons, "ProcessPoolExecutor", lambda *_: _Here())
-    told: list[tuple[str, int, int]] = []
-
-    def report(doing: str, done: int, total: int, loss: float) -> None:
-        told.append((doing, done, total))
-
+    told = Told()
     with pytest.raises(CaptureError, match="nothing to go on with"):
-        train_made_tracker(replace(options, resume=True), report)
-    train_made_tracker(options, report)
-    assert told[:2] == [("pictures", 0, 1), ("pictures", 1, 1)] and told[-1] == ("training", 4, 4)
+        train_made_tracker(replace(options, resume=True), told.progress)
+    train_made_tracker(options, told.progress)
+    assert told.counts[:2] == [("pictures", 0, 1), ("pictures", 1, 1)]
+    assert told.counts[-1] == ("training", 4, 4)
     first = read_tracker(options.out)
     made = next(options.pictures.iterdir())
     written = made.stat().st_mtime_ns
-    told.clear()
-    train_made_tracker(replace(options, resume=True, steps=6), report)
-    assert told == [("pictures", 1, 1), ("training", 5, 6), ("training", 6, 6)]
+    told = Told()
+    train_made_tracker(replace(options, resume=True, steps=6), told.progress)
+    assert told.counts == [
+        ("pictures", 1, 1),
+        ("training", 4, 6),
+        ("training", 5, 6),
+        ("training", 6, 6),
+    ]
     assert made.stat().st_mtime_ns == written
     second = read_tracker(options.out)
     assert torch.equal(first.points.vertices, second.points.vertices)

@@ -9,6 +9,7 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from told import Told
 from torch import Tensor
 
 from handavatar.avatar import CheckpointError
@@ -48,9 +49,9 @@ def _options(out: Path) -> PriorOptions:
 
 
 def test_training_repeats_with_its_seed_and_writes_what_it_returns(tmp_path: Path) -> None:
-    reported: list[int] = []
+    told = Told()
     fields = [
-        train_prior(options, lambda step, figures: reported.append(step))
+        train_prior(options, told.progress)
         for options in (
             _options(tmp_path / "a"),
             _options(tmp_path / "b"),
@@ -60,7 +61,7 @@ def test_training_repeats_with_its_seed_and_writes_what_it_returns(tmp_path: Pat
     states = [field.state_dict() for field in fields]
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
     assert not all(torch.equal(states[0][name], states[2][name]) for name in states[0])
-    assert reported == [4, 4, 4]
+    assert told.steps == [0, 1, 2, 3, 4] * 3
     loaded = PairOccupancy()
     load_prior(loaded, tmp_path / "a")
     assert all(torch.equal(value, states[0][name]) for name, value in loaded.state_dict().items())

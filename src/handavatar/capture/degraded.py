@@ -20,6 +20,7 @@ from handavatar.capture.motion import Motion, write_motion
 from handavatar.errors import SEEDS, require_ranges
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
+from handavatar.jobs.progress import SILENT, Progress
 
 _TRACKED = 0.5
 """Confidence of poses that are no longer exact."""
@@ -65,13 +66,19 @@ class DegradeOptions:
         )
 
 
-def degrade_capture(folder: Path, options: DegradeOptions, overwrite: bool = False) -> Capture:
+def degrade_capture(
+    folder: Path,
+    options: DegradeOptions,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> Capture:
     """Writes a worse copy of a capture.
 
     Args:
         folder: where the copy is to be.
         options: the source, and what happens to it.
         overwrite: replace a capture that is there.
+        progress: told the frames done.
 
     Raises:
         CaptureError: if the source is damaged or the folder is in use.
@@ -94,6 +101,7 @@ def degrade_capture(folder: Path, options: DegradeOptions, overwrite: bool = Fal
         noise = _PoseNoise(options, random)
         for index in range(len(source.records)):
             writer.add(_degraded(source.frame(index), options, noise))
+            progress(index + 1, len(source.records))
         if (source.folder / "truth").is_dir():
             shutil.copytree(
                 source.folder / "truth", writer.file("truth/poses.json").parent, dirs_exist_ok=True

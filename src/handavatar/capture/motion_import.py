@@ -1,7 +1,6 @@
 """Motions from what was filmed, or from other programs' files, at equal steps of time."""
 
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -23,6 +22,7 @@ from handavatar.errors import require_ranges
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import refuse_file_in_use
+from handavatar.jobs.progress import SILENT, Progress
 
 _MOST_FPS = 240.0
 
@@ -71,14 +71,14 @@ class MotionFromOptions:
 def motion_from(
     options: MotionFromOptions,
     tell: Tell,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress = SILENT,
 ) -> Motion:
     """The motion of a hand that was filmed, or that another program's file holds.
 
     Args:
         options: of what.
         tell: called with what a person should know.
-        progress: called with the share of a video's work that is done.
+        progress: told how far it is.
 
     Raises:
         CaptureError: there is no hand in it, the poses have no times, or a file is not what it is

@@ -22,7 +22,7 @@ The truth beside the frames lies in ``truth/`` in the same stored space as the p
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -66,6 +66,7 @@ from handavatar.hand.pose_sampling import (
 )
 from handavatar.hand.rig import Rig, ShapedHand
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.progress import SILENT, Progress
 
 TRAINING_GESTURES = (
     "relaxed",
@@ -185,7 +186,7 @@ def make_capture(
     folder: Path,
     options: SynthOptions,
     overwrite: bool = False,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = SILENT,
 ) -> Capture:
     """Renders a made capture into a folder.
 
@@ -193,7 +194,7 @@ def make_capture(
         folder: where the capture is to be.
         options: subject, motion and quality.
         overwrite: replace a capture that is there.
-        on_progress: called with frames done and frames in total.
+        progress: told the frames done.
 
     Raises:
         CaptureError: if Mitsuba is missing or the folder is in use.
@@ -228,7 +229,7 @@ def make_capture(
             writer.add(frame)
             _write_truth(writer, frame, traced, maps, options.geometry_truth)
             pictures.append(frame.image)
-            on_progress(done, total)
+            progress(done, total)
         noise = _noise(subject, motions["test"], options)
         _write_subject(writer, subject, options, noise)
         sheet = contact_sheet(pictures[:: max(1, total // 40)])

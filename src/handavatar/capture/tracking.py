@@ -6,7 +6,7 @@ by 35 degrees either way. Their median is steadier than any one of them, and whe
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from types import TracebackType
@@ -27,6 +27,7 @@ from handavatar.capture.windows import (
     resampled,
     window_around,
 )
+from handavatar.jobs.progress import SILENT, Progress
 
 LANDMARK_NAMES: tuple[str, ...] = (
     "wrist",
@@ -298,10 +299,13 @@ class HandFinder:
         return min(found, key=lambda s: _distance(s.landmarks, around), default=None)
 
 
+_USUAL_FRAMES = 60
+
+
 def track_hand(
     frames: Iterable[VideoFrame],
     side: str = "auto",
-    progress: Callable[[int, str], None] | None = None,
+    progress: Progress = SILENT,
     which: WhichHand = "only",
     finder: Finder | None = None,
 ) -> Track:
@@ -310,7 +314,7 @@ def track_hand(
     Args:
         frames: upright pictures in the order of time.
         side: ``left`` or ``right`` to overrule the tracker, which takes the video as not mirrored.
-        progress: called with the number of frames done and a word.
+        progress: told how far it is: nobody knows how many frames there are.
         which: of two hands.
         finder: of hands; MediaPipe's if None.
 
@@ -375,7 +379,7 @@ def _all_hands(
     finder: Finder,
     frames: Iterable[VideoFrame],
     both: bool,
-    progress: Callable[[int, str], None] | None,
+    progress: Progress,
 ) -> tuple[list[_LookedAt], list[Glance], tuple[int, int]]:
     """The hands of all pictures; where there are two, none unless both are asked for."""
     looked: list[_LookedAt] = []
@@ -402,8 +406,8 @@ def _all_hands(
         if hands:
             last = [seen.hand.landmarks for seen in hands]
         looked.append(_LookedAt(frame.index, hands, are_two))
-        if progress is not None:
-            progress(count + 1, "tracking")
+        # Each frame is a part of what is left.
+        progress((count + 1) / (count + 1 + _USUAL_FRAMES), 1.0, f"picture {count + 1}")
     return looked, glances, picture_size
 
 

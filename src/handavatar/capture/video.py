@@ -1,6 +1,6 @@
 """A person's own video of one hand, made into a capture: track, mask, fit, crop, write."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -13,7 +13,6 @@ from handavatar.capture.clip_gains import match_clips
 from handavatar.capture.clips import (
     Clip,
     LaidClip,
-    Progress,
     clip_of,
     lay_hand,
     on_all_cores,
@@ -56,6 +55,7 @@ from handavatar.geometry.rotations import mirror_rigid
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import files_named
+from handavatar.jobs.progress import SILENT, Progress
 
 TrackerChoice = Literal["auto", "own", "mediapipe", "both"]
 """Who finds hands and their landmarks in a video."""
@@ -170,7 +170,7 @@ class VideoOptions:
 def capture_video(
     options: VideoOptions,
     rig: Rig | None = None,
-    progress: Progress | None = None,
+    progress: Progress = SILENT,
     track: Track | None = None,
 ) -> Capture:
     """Makes a capture of a video of one hand, or of several of the same hand.
@@ -181,7 +181,7 @@ def capture_video(
     Args:
         options: which video, where to, how.
         rig: the hand to lay onto the pictures; the one that the options name if None.
-        progress: called now and then.
+        progress: told how far it is.
         track: what the tracker found in the one video already; it is tracked if None.
 
     Returns:
@@ -192,7 +192,9 @@ def capture_video(
         CaptureError: the video cannot be used, the folder is in use, or an extra is missing. If the
             pictures are the cause, a folder beside the would-be capture shows them.
     """
-    report = progress or (lambda share, doing: None)
+    stages = progress.stages(
+        {"finding the hand": 40.0, "laying the hand": 50.0, "cropping": 5.0, "writing": 5.0}
+    )
     videos = options.of_each_clip()
     if len(videos) > MAX_CLIPS:
         raise ArgumentError("more", f"{len(videos)} videos", f"at most {MAX_CLIPS} of one hand")
@@ -201,13 +203,10 @@ def capture_video(
     header = _header(options, rig)
     CaptureWriter(options.out, **header)  # type: ignore[arg-type]  # refuses a folder in use now
     clips: list[Clip] = []
+    parts = stages["finding the hand"].equal_parts(len(videos))
     for number, (video, camera) in enumerate(zip(videos, cameras, strict=True)):
-
-        def finding(done: int, _: str, first: int = number) -> None:
-            report(0.4 * (first + done / (done + 60)) / len(videos), "finding the hand")
-
         try:
-            clips.append(_tracked_clip(video, rig, camera, finding, track))
+            clips.append(_tracked_clip(video, rig, camera, parts[number], track))
         except UnusableTrackError as error:
             unusable = TriedClip(video.file.name, error.track, number=number)
             raise failure(options.out, error.what, error.remedy, [unusable]) from error
@@ -218,15 +217,15 @@ def capture_video(
     ]
     try:
         _check_one_side(tried)
-        laid = lay_hand(clips, rig, options.fit, options.register, report)
+        laid = lay_hand(clips, rig, options.fit, options.register, stages["laying the hand"])
     except CaptureError as error:
         raise failure(options.out, error.what, error.remedy, tried) from error
-    results = _cropped(laid, rig, options, report)
+    results = _cropped(laid, rig, options, stages["cropping"])
     tried = [
         replace(clip, track=hands.clip.track, results=found, focal=hands.fitted.fit.focal)
         for clip, found, hands in zip(tried, results, laid, strict=True)
     ]
-    report(0.96, "writing")
+    stages["writing"](0.0)
     frames = kept_frames(tried)
     if len(frames) < MIN_KEPT:
         raise failure(options.out, *too_few(tried, len(frames)), tried)
@@ -242,14 +241,14 @@ def capture_video(
         shape_coefficients=shape,
         **header,  # type: ignore[arg-type]
     ) as writer:
-        for frame in frames:
+        for number, frame in enumerate(frames):
             writer.add(frame)
+            stages["writing"](number + 1, len(frames))
         save_json(writer.file("skipped.json"), skipped(tried))
         about = agreement(tried) | {"summary": summary(tried, frames, seen)}
         save_json(writer.file("fit.json"), about)
         writer.file("seen.safetensors").write_bytes(save({"counts": seen.counts.int()}))
         overview(tried, writer.file("overview.png"))
-    report(1.0, "done")
     return read_capture(options.out)
 
 
@@ -295,13 +294,15 @@ def _check_one_side(clips: Sequence[TriedClip]) -> None:
 
 
 def _cropped(
-    laid: Sequence[LaidClip], rig: Rig, options: VideoOptions, report: Progress
+    laid: Sequence[LaidClip], rig: Rig, options: VideoOptions, progress: Progress
 ) -> list[list[FittedFrame]]:
     """All pictures of all recordings, of one size."""
     boxes = [
         [box_in_front(clip, number, rig) for number in range(len(clip.masks))] for clip in laid
     ]
     size = options.size or stored_size([box.side for of_clip in boxes for box in of_clip])
+
+    parts = progress.equal_parts(len(laid))
 
     def of_clip(number: int) -> list[FittedFrame]:
         clip = laid[number]
@@ -310,24 +311,24 @@ def _cropped(
                 clip, hand, boxes[number][hand], rig, size, options.min_confidence, number
             ),
             range(len(clip.masks)),
-            lambda share: report(0.9 + 0.05 * (number + share) / len(laid), "cropping"),
+            parts[number],
         )
 
     return [of_clip(number) for number in range(len(laid))]
 
 
-def track_video(options: VideoOptions, progress: Callable[[int, str], None] | None = None) -> Track:
+def track_video(options: VideoOptions, progress: Progress = SILENT) -> Track:
     """Finds the hand in the pictures of a video.
 
     Args:
         options: which video, pictures and hand.
-        progress: called with the number of pictures done and a word.
+        progress: told how far it is.
 
     Raises:
         UnusableTrackError: there is no hand to go on with.
         CaptureError: the video cannot be read, or an extra is missing.
     """
-    return _tracked(options, None, progress or (lambda done, doing: None)).track
+    return _tracked(options, None, progress).track
 
 
 @dataclass(eq=False)
@@ -339,9 +340,7 @@ class _Tracked:
     pinhole: Pinhole | None
 
 
-def _tracked(
-    options: VideoOptions, camera: KnownCamera | None, progress: Callable[[int, str], None]
-) -> _Tracked:
+def _tracked(options: VideoOptions, camera: KnownCamera | None, progress: Progress) -> _Tracked:
     if options.hand == "both":
         raise ArgumentError(
             "hand", "both makes two captures: ask for one of VideoOptions.of_each_hand"
@@ -381,7 +380,7 @@ def _tracked_clip(
     options: VideoOptions,
     rig: Rig,
     camera: KnownCamera | None,
-    progress: Callable[[int, str], None],
+    progress: Progress,
     track: Track | None,
 ) -> Clip:
     """One recording, with all that the user says of it."""

@@ -5,7 +5,6 @@ in 1e-4 m in the table.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -28,6 +27,7 @@ from handavatar.hand.skin_refinement import (
     refine_skin,
     strongest_bones,
 )
+from handavatar.jobs.progress import SILENT, Progress
 
 EVALUATION_SEED = 1_000_033
 """Evaluation poses come from a seed that no refinement draws."""
@@ -144,14 +144,12 @@ def measure_skin(
     )
 
 
-def skin_table(
-    options: SkinTableOptions, report: Callable[[int], None] | None = None
-) -> ResultTable:
+def skin_table(options: SkinTableOptions, progress: Progress = SILENT) -> ResultTable:
     """Refines the weights with every seed and measures all rows on the same poses.
 
     Args:
         options: see :class:`SkinTableOptions`.
-        report: called with the steps done.
+        progress: told the steps done.
 
     Returns:
         Lengths in 1e-4 m with half the width of their 95 % confidence interval over poses (values
@@ -169,8 +167,7 @@ def skin_table(
     def count(state: RefinementState, figures: dict[str, float]) -> None:
         nonlocal done
         done += 1
-        if report is not None:
-            report(done)
+        progress(done, options.total_steps, **figures)
 
     problem = SkinRefinement.of(base, options.rounds, ours)
     fine = problem.fine
@@ -191,7 +188,7 @@ def skin_table(
     for seed in options.seeds:
         for name, variant in variants.items():
             seeded = replace(problem, options=replace(variant, seed=seed))
-            skins = refine_skin(seeded, report=count)
+            skins = refine_skin(seeded, after_step=count)
             if name == "dense":
                 rows["HD, refined without l0"].append(measured(skins.free))
             elif name == "paper":

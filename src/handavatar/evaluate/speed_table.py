@@ -44,6 +44,7 @@ from handavatar.geometry.cameras import (
 )
 from handavatar.hand.pose import BONE_PARENTS, NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import GESTURES, gesture_rotations
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.plain import plain_rays
 
 _WAYS = {
@@ -133,14 +134,12 @@ class Scene:
     rays: Rays
 
 
-def speed_table(
-    options: SpeedTableOptions, report: Callable[[int], None] | None = None
-) -> ResultTable:
+def speed_table(options: SpeedTableOptions, progress: Progress = SILENT) -> ResultTable:
     """Times the plain reference, the exact and the near-exact way side by side.
 
     Args:
         options: what to time.
-        report: told the number of pieces of work done.
+        progress: told the number of pieces of work done.
 
     Raises:
         CheckpointError: if the avatar cannot be read.
@@ -150,7 +149,7 @@ def speed_table(
     device = chosen_device(options.device)
     ways = _ways(device)
     avatar = HandAvatar.load(options.avatar).moved_to(device)
-    finished = step_counter(report)
+    finished = step_counter(progress, options.total_steps)
     with torch.no_grad():
         scenes = [
             _scene(avatar, name, number, options.size, options.plain_rays)

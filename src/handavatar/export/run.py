@@ -15,7 +15,7 @@ from handavatar.edit import Edit
 from handavatar.errors import ArgumentError, require_ranges
 from handavatar.export.baking import baked_textures, colors_at_vertices
 from handavatar.export.gltf import glb_bytes
-from handavatar.export.lightweight import Tell, lightweight_hand
+from handavatar.export.lightweight import lightweight_hand
 from handavatar.export.polygons import obj_bytes, ply_bytes
 from handavatar.export.rigged import MIRROR, skinned_mesh
 from handavatar.export.skeletons import BoneNames
@@ -31,6 +31,7 @@ from handavatar.jobs.files import (
     refuse_folder_in_use,
     write_atomically,
 )
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.retouch import Look
 
 MAX_TEXTURE = 8192
@@ -73,12 +74,12 @@ class ExportOptions(Look):
         require_ranges(self, texture_size=(16, MAX_TEXTURE))
 
 
-def export_avatar(options: ExportOptions, tell: Tell = lambda job, step, total: None) -> Path:
+def export_avatar(options: ExportOptions, progress: Progress = SILENT) -> Path:
     """Writes the files, aside first.
 
     Args:
         options: what to write.
-        tell: hears how far work is that takes minutes.
+        progress: told how far it is.
 
     Returns:
         The file or folder that was asked for.
@@ -95,7 +96,7 @@ def export_avatar(options: ExportOptions, tell: Tell = lambda job, step, total: 
     avatar = HandAvatar.load(options.run)
     edit = options.edit_on(avatar)
     if options.format == "web":
-        _write_web(avatar, edit, options, tell)
+        _write_web(avatar, edit, options, progress)
         return options.out
     if options.format == "glb":
         contents = [_glb(avatar, edit, options)]
@@ -150,9 +151,9 @@ def _motion(avatar: HandAvatar, edit: Edit, options: ExportOptions) -> Motion | 
     return open_motion(options.motion, avatar.base_rig, start_of(avatar.view(edit)))
 
 
-def _write_web(avatar: HandAvatar, edit: Edit, options: ExportOptions, tell: Tell) -> None:
+def _write_web(avatar: HandAvatar, edit: Edit, options: ExportOptions, progress: Progress) -> None:
     motion = _motion(avatar, edit, options)
-    light = lightweight_hand(avatar, edit, tell)
+    light = lightweight_hand(avatar, edit, progress)
     folder = UnfinishedFolder(options.out, WEB_PAGE, {"format": "web"}, _inputs(options))
     try:
         folder.begin(options.overwrite)

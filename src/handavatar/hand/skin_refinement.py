@@ -459,14 +459,14 @@ class SkinRefinement:
 def refine_skin(
     problem: SkinRefinement,
     state: RefinementState | None = None,
-    report: Callable[[RefinementState, dict[str, float]], None] | None = None,
+    after_step: Callable[[RefinementState, dict[str, float]], None] | None = None,
 ) -> RefinedWeights:
     """Refines the weights of a subdivided rig.
 
     Args:
         problem: rig and options.
         state: where to continue; the beginning by default.
-        report: called after every step.
+        after_step: is given every state and its figures.
 
     Raises:
         NotFinite: if a weight or what moves it is no longer finite.
@@ -477,6 +477,6 @@ def refine_skin(
     state = problem.begin() if state is None else state
     while state.step < problem.total_steps:
         state, figures = problem.advanced(state)
-        if report is not None:
-            report(state, figures)
+        if after_step is not None:
+            after_step(state, figures)
     return problem.result(state)

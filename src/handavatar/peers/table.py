@@ -17,6 +17,7 @@ from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable, step_counter
 from handavatar.evaluate.textured_mesh import RAYS, fit_textured_mesh
 from handavatar.jobs.files import make_folder
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.peers.inverse_skinning import fit_inverse_skinning
 from handavatar.train.ablation import (
     ROWS,
@@ -70,21 +71,19 @@ class PeersTableOptions:
         return (len(OURS) + len(PEERS)) * len(self.seeds) * len(self.captures)
 
 
-def peers_table(
-    options: PeersTableOptions, report: Callable[[int], None] | None = None
-) -> ResultTable:
+def peers_table(options: PeersTableOptions, progress: Progress = SILENT) -> ResultTable:
     """Fits everything to every capture, and judges the frames that none has seen.
 
     Args:
         options: what to compare.
-        report: told the number of trainings done.
+        progress: told the number of trainings done.
 
     Raises:
         CaptureError: if a capture is damaged, or what is kept is of another capture or commit.
 
     Source: paper Sec. 4.3, comparison with prior art.
     """
-    finished = step_counter(report)
+    finished = step_counter(progress, options.total_steps)
     measured: list[dict[str, Any]] = []
     about = {
         "seeds": list(options.seeds),

@@ -7,7 +7,6 @@ truth lies beside the video, see :mod:`handavatar.synthetic.truth`.
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -39,6 +38,7 @@ from handavatar.hand.pose_sampling import (
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import write_atomically
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.video_writer import VideoWriter
 from handavatar.render.rasterize import rasterize_projected
 from handavatar.synthetic.actor import Actor, Lights, PosedActor, draw_lights
@@ -186,15 +186,13 @@ FILMS: tuple[FilmOptions, ...] = (
 """The films of ``handavatar bench --table registration``."""
 
 
-def make_film(
-    options: FilmOptions, folder: Path, report: Callable[[int], None] = lambda done: None
-) -> Path:
+def make_film(options: FilmOptions, folder: Path, progress: Progress = SILENT) -> Path:
     """Renders a film and its truth.
 
     Args:
         options: which.
         folder: where ``NAME.mp4``, ``NAME.json`` and ``NAME.safetensors`` are to be.
-        report: told the number of pictures that are done.
+        progress: told the number of pictures that are done.
 
     Returns:
         The path of the video.
@@ -213,7 +211,7 @@ def make_film(
             picture, mask = stage.frame(frame)
             recorder.add(picture)
             masks.append(mask)
-            report(frame + 1)
+            progress(frame + 1, options.num_frames)
         # The video is there last: who finds it finds the truth as well.
         _write_truth(path, options, base, stage, masks)
     return path

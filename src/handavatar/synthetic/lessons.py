@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
@@ -19,6 +19,8 @@ from handavatar.errors import SEEDS, raise_if_refused, require_ranges
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import refuse_file_in_use, write_atomically
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.signals import is_stopping, unbroken
 from handavatar.synthetic.crops import MadeCrops, make_crops
 from handavatar.tracker.measures import TrackerFigures, measure_tracker
 from handavatar.tracker.model import (
@@ -48,8 +50,6 @@ _JUDGED_FROM = 1_000_000
 """Seeds from here on are never taught with."""
 _IN_USE = TrackerOptions(turn=0.2, any_turn=0.0, sides=(1.3, 1.6), shift=0.05, mirrored=0.0)
 """How hands lie in crops that are cut about where they were seen before."""
-Report = Callable[[str, int, int, float], None]
-"""Told what is being done, how much of it, of how much, and the loss."""
 
 
 @dataclass(frozen=True)
@@ -105,19 +105,21 @@ class TrackerEvaluateOptions:
         require_ranges(self, count=(1, 10**7))
 
 
-def train_made_tracker(
-    options: TrackerTrainOptions, report: Report | None = None
-) -> TrainedTracker:
+def train_made_tracker(options: TrackerTrainOptions, progress: Progress = SILENT) -> TrainedTracker:
     """Makes what pictures are missing, teaches a network, writes it.
 
+    Args:
+        options: how it is taught.
+        progress: told how far it is.
+
     Raises:
+        Interrupted: the command was told to stop; ``resume`` goes on with the state that it left.
         CaptureError: nothing to go on with, or a damaged file.
         FolderInUse: there is a file at ``out`` already.
         NotFinite: the loss, a weight or the optimiser's state is no longer finite; it names what,
             in which step, and how to go on.
         TrackerError: the file to start from is no tracker, or one of other points.
     """
-    tell = report or (lambda doing, done, total, loss: None)
     state_file = options.out.with_suffix(".state")
     for path in (options.out, state_file):
         refuse_file_in_use(path, options.overwrite or options.resume)
@@ -127,7 +129,8 @@ def train_made_tracker(
         )
     rig = load_rig(RIG)
     points = TrackedPoints.of(rig, NUM_SKIN_POINTS)
-    files = make_pictures(options, lambda done, total: tell("pictures", done, total, 0.0))
+    stages = progress.stages({"pictures": 0.02 * options.count, "training": 1.0 * options.steps})
+    files = make_pictures(options, stages["pictures"])
     torch.manual_seed(options.seed)
     network = HandNetwork(len(points))
     if options.start is not None:
@@ -149,16 +152,20 @@ def train_made_tracker(
             ) from error
     lessons = draw_lessons(read_pictures(files), training)
     saved, written = time.monotonic(), training.step
+    stages["training"].skip(training.step, options.steps)
     for batch in lessons:
-        loss = training.teach(batch)
+        with unbroken():
+            loss = training.teach(batch)
         is_saved = time.monotonic() - saved > _SAVED_EVERY or training.step == options.steps
+        is_saved = is_saved or is_stopping()
         state = training.state() if is_saved else {}
         if found := find_not_finite({"loss": loss, **state}):
             raise NotFinite(f"step {training.step}: {found}", _way_from(options, written))
-        tell("training", training.step, options.steps, loss)
         if is_saved:
-            write_atomically({state_file: save(state)})
+            with unbroken():
+                write_atomically({state_file: save(state)})
             saved, written = time.monotonic(), training.step
+        stages["training"](training.step, options.steps, loss=loss)
     tracker = TrainedTracker(training.taught().cpu(), points)
     record = {
         "pictures": IN_A_FILE * len(files),
@@ -210,19 +217,19 @@ def draw_lessons(pictures: CropBatch, training: TrackerTraining) -> Iterator[Cro
         yield pictures.chosen(chosen)
 
 
-def make_pictures(options: TrackerTrainOptions, report: Callable[[int, int], None]) -> list[Path]:
+def make_pictures(options: TrackerTrainOptions, progress: Progress = SILENT) -> list[Path]:
     """Files of made pictures, of which those that are missing are made."""
     options.pictures.mkdir(parents=True, exist_ok=True)
     seeds = range(options.seed, options.seed + -(-options.count // IN_A_FILE))
     files = [options.pictures / f"made-{seed:06d}.safetensors" for seed in seeds]
     missing = [(file, seed) for file, seed in zip(files, seeds, strict=True) if not file.is_file()]
-    report(len(files) - len(missing), len(files))
+    progress.skip(len(files) - len(missing), len(files))
     if not missing:
         return files
     processes = options.processes or os.cpu_count() or 1
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
         for done, _ in enumerate(pool.map(_make_file, *zip(*missing, strict=True)), start=1):
-            report(len(files) - len(missing) + done, len(files))
+            progress(len(files) - len(missing) + done, len(files))
     return files
 
 

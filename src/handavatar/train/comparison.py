@@ -31,6 +31,7 @@ from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
 from handavatar.jobs.files import make_folder, write_aside
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.train.attention import attention_figures, attention_picture, read_attention
 from handavatar.train.kept import commit_notes, present_commit
 from handavatar.train.labelled_poses import LabelledPose
@@ -150,14 +151,14 @@ class DecoderScores:
 def compare_decoders(
     options: ComparisonOptions,
     measures: Sequence[Measure] = (),
-    report: Callable[[str, int, dict[str, float]], None] | None = None,
+    progress: Progress = SILENT,
 ) -> dict[str, Any]:
     """Trains every decoder with every seed and judges all on the same poses.
 
     Args:
         options: see :class:`ComparisonOptions`.
         measures: further columns, such as Laplacian, Chamfer and seam of extracted meshes.
-        report: called now and then with what is being trained, the step and current figures.
+        progress: told what is being trained, and how far it is.
 
     Returns:
         A value for JSON: ``options``, ``commits`` (of each training), ``note``, ``decoders`` (by
@@ -190,9 +191,18 @@ def compare_decoders(
         )
         return evaluation_poses(options_of, untrained_field("pair").margin)
 
+    names = [f"{one.name}-{seed}" for one in contenders(options) for seed in options.seeds]
+    parts = progress.stages(dict.fromkeys(names, 1.0))
     for contender in contenders(options):
         trainings = [
-            _training(options, contender, seed, judged_by, measures, report)
+            _training(
+                options,
+                contender,
+                seed,
+                judged_by,
+                measures,
+                parts[f"{contender.name}-{seed}"],
+            )
             for seed in options.seeds
         ]
         for seed, training in zip(options.seeds, trainings, strict=True):
@@ -310,7 +320,7 @@ def _training(
     seed: int,
     judged_by: Callable[[int], Judges],
     measures: Sequence[Measure],
-    report: Callable[[str, int, dict[str, float]], None] | None,
+    progress: Progress,
 ) -> dict[str, Any]:
     """What one training reached: read where it is kept, else trained, judged and kept.
 
@@ -340,7 +350,7 @@ def _training(
             folder=options.priors / name,
             device=options.device,
         ),
-        None if report is None else lambda step, figures: report(name, step, figures),
+        progress,
     ).to("cpu")
     seconds = time.perf_counter() - start
     columns = _columns(field, *judged_by(contender.rounds), options, measures)

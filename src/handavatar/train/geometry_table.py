@@ -1,7 +1,7 @@
 """``handavatar bench --table geometry``: every decoder, by IoU and by its extracted meshes."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,6 +13,7 @@ from handavatar.field.decoders import OccupancyField
 from handavatar.field.occupancy import HandCodes
 from handavatar.hand.parts import Parts, divide_into_parts
 from handavatar.hand.rig import PosedHand
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.train.comparison import (
     ComparisonOptions,
     compare_decoders,
@@ -82,24 +83,15 @@ class MeshMeasure:
         return {name: float(getattr(row, name)) for name in _MESH_COLUMNS}
 
 
-def geometry_table(
-    options: GeometryTableOptions, report: Callable[[int], None] | None = None
-) -> ResultTable:
+def geometry_table(options: GeometryTableOptions, progress: Progress = SILENT) -> ResultTable:
     """Trains and judges; see :func:`handavatar.train.comparison.compare_decoders`.
 
     Args:
         options: what to compare.
-        report: told the number of training steps done.
+        progress: told how far it is.
 
     Source: paper Sec. 4.2, table of geometry.
     """
-    done: dict[str, int] = {}
-
-    def progress(name: str, step: int, _: dict[str, float]) -> None:
-        done[name] = step
-        if report is not None:
-            report(sum(done.values()))
-
     measure = MeshMeasure(options.resolution)
     table = comparison_table(compare_decoders(options, (measure,), progress))
     what = (

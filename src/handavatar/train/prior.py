@@ -10,7 +10,6 @@ takes any abbreviation of its own options for itself: no option here may begin o
 
 import json
 import math
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -34,6 +33,8 @@ from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import is_empty, refuse_file_in_use, write_atomically
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.signals import Interrupted, heard_signals, is_stopping, unbroken
 from handavatar.processes import Processes, joined_processes
 from handavatar.train.divergence import divergence_noted, take_seed
 from handavatar.train.labelled_poses import LabelledPose, PoseStream, labelled_pose
@@ -49,7 +50,6 @@ from handavatar.train.pretraining import (
 )
 from handavatar.train.runs import Run, append_log, locked, truncate_log
 from handavatar.train.stage_times import StageTimes
-from handavatar.train.stopping import Interrupted, stop_signals
 
 SHIPPED_PRIOR = Path(__file__).parent.parent / "assets" / "prior.safetensors"
 """Made in stages, each from the result of the last:
@@ -134,9 +134,7 @@ class PriorOptions:
         )
 
 
-def train_prior(
-    options: PriorOptions, report: Callable[[int, dict[str, float]], None] | None = None
-) -> OccupancyField:
+def train_prior(options: PriorOptions, progress: Progress = SILENT) -> OccupancyField:
     """Pre-trains the occupancy field and writes it.
 
     Started by ``torchrun``, the processes share the poses of every step and keep equal weights;
@@ -144,9 +142,9 @@ def train_prior(
 
     Args:
         options: see :class:`PriorOptions`.
-        report: called now and then with the step and the current figures: ``loss``,
-            ``samples_per_second`` (labelled points, of all processes together), and the share of
-            each stage of the first process's time, as ``share_...``; since the start of this call.
+        progress: told the steps done and the current figures: ``loss``, and ``samples`` a second
+            (labelled points, of all processes together). The log of ``folder`` has besides the
+            share of each stage of the first process's time, as ``share_...``.
 
     Raises:
         CheckpointError: if ``folder`` holds something else than a run with these options.
@@ -167,7 +165,7 @@ def train_prior(
     is_begun = options.folder is not None and not is_empty(options.folder)
     refuse_file_in_use(options.out, options.overwrite or is_begun)
     base = load_rig(options.rig, options.level)
-    with joined_processes(options.device) as processes, stop_signals() as stopped:
+    with joined_processes(options.device) as processes, heard_signals():
         if options.poses % processes.count:
             raise ArgumentError(
                 "poses",
@@ -181,7 +179,7 @@ def train_prior(
                 held.enter_context(locked(run))
                 begun, words = run.options["seed"], argument("folder", options.folder)
                 held.enter_context(divergence_noted(run, begun, options.seed, words))
-            return _trained(options, base, processes, run, stopped, report)
+            return _trained(options, base, processes, run, progress)
 
 
 def _trained(
@@ -189,8 +187,7 @@ def _trained(
     base: Rig,
     processes: Processes,
     run: Run | None,
-    stopped: Callable[[], bool],
-    report: Callable[[int, dict[str, float]], None] | None,
+    progress: Progress,
 ) -> OccupancyField:
     """The loop; ``run`` is the first process's alone."""
     torch.manual_seed(options.seed)
@@ -220,54 +217,62 @@ def _trained(
         if run.log.exists():
             truncate_log(run, done)
     written = 0
+    note = ""
+    progress.skip(done, options.steps)
     for step in range(done + 1, options.steps + 1):
-        first = (step - 1) * options.poses + processes.rank
-        own = range(first, step * options.poses, processes.count)
-        samples = [stream.drawn(number, times) for number in own]
-        set_rate(optimizers, learning_rate(step, options.steps, options.lr, options.final_lr))
-        field.zero_grad()
-        loss = loss_of(samples)
-        with times.stage("backward"):
-            loss.backward()
-        with times.stage("optimizer"):
-            torch.nn.utils.clip_grad_norm_(field.parameters(), 1.0)
-            for optimizer in optimizers.values():
-                optimizer.step()
-        value = float(loss.detach())
-        with times.stage("wait"):
-            is_stopped = processes.any(stopped())
-        is_last = step == options.steps or is_stopped
-        is_saved = step % options.checkpoint_every == 0 or is_last
-        values: dict[str, object] = {"loss": value, **field.state_dict()}
-        if is_saved:
-            values |= {name: optimizer_tensors(part) for name, part in optimizers.items()}
-        found = find_not_finite(values)
-        # All processes end, or those that found nothing would wait for the others for ever.
-        with times.stage("wait"):
-            if processes.any(found is not None):
-                found = found or "the loss of another process is not finite"
-                raise NotFinite(f"step {step}: {found}", _way_from(options, written))
-        average = value if math.isnan(average) else 0.99 * average + 0.01 * value
-        if processes.is_first and (step % 100 == 0 or is_last):
-            points = (step - done) * options.poses * options.points
-            figures = {"loss": average, "samples_per_second": points / times.seconds}
-            figures |= {f"share_{name}": share for name, share in times.shares().items()}
-            if report is not None:
-                report(step, figures)
-            if run is not None:
-                append_log(run, step, figures)
-        if processes.is_first and is_saved:
-            save_prior(field, options, base, step)
-            written = step
-            if run is not None:
-                save_progress(run, step, field, optimizers, average)
-        if is_stopped and step < options.steps:
-            way = (
-                f"continue with {argument('folder', options.folder)}"
-                if options.folder
-                else f"so far: {options.out}"
-            )
-            raise Interrupted(f"stopped at step {step}; {way}")
+        # The processes stop together: at the end of a step.
+        with unbroken():
+            first = (step - 1) * options.poses + processes.rank
+            own = range(first, step * options.poses, processes.count)
+            samples = [stream.drawn(number, times) for number in own]
+            set_rate(optimizers, learning_rate(step, options.steps, options.lr, options.final_lr))
+            field.zero_grad()
+            loss = loss_of(samples)
+            with times.stage("backward"):
+                loss.backward()
+            with times.stage("optimizer"):
+                torch.nn.utils.clip_grad_norm_(field.parameters(), 1.0)
+                for optimizer in optimizers.values():
+                    optimizer.step()
+            value = float(loss.detach())
+            with times.stage("wait"):
+                is_stopped = processes.any(is_stopping())
+            is_last = step == options.steps or is_stopped
+            is_saved = step % options.checkpoint_every == 0 or is_last
+            values: dict[str, object] = {"loss": value, **field.state_dict()}
+            if is_saved:
+                values |= {name: optimizer_tensors(part) for name, part in optimizers.items()}
+            found = find_not_finite(values)
+            # All processes end, or those that found nothing would wait for the others for ever.
+            with times.stage("wait"):
+                if processes.any(found is not None):
+                    found = found or "the loss of another process is not finite"
+                    raise NotFinite(f"step {step}: {found}", _way_from(options, written))
+            average = value if math.isnan(average) else 0.99 * average + 0.01 * value
+            if processes.is_first and (step % 100 == 0 or is_last):
+                points = (step - done) * options.poses * options.points
+                figures = {"loss": average, "samples_per_second": points / times.seconds}
+                figures |= {f"share_{name}": share for name, share in times.shares().items()}
+                shares = sorted(
+                    ((v, k[6:]) for k, v in figures.items() if k[:6] == "share_"), reverse=True
+                )
+                speed = f"{figures['samples_per_second']:,.0f} labelled points/s"
+                note = "; ".join([speed, *(f"{name} {share:.0%}" for share, name in shares)])
+                if run is not None:
+                    append_log(run, step, figures)
+            if processes.is_first and is_saved:
+                save_prior(field, options, base, step)
+                written = step
+                if run is not None:
+                    save_progress(run, step, field, optimizers, average)
+            if is_stopped and step < options.steps:
+                way = (
+                    f"{options.folder}: the same command goes on from there"
+                    if options.folder
+                    else f"so far: {options.out}"
+                )
+                raise Interrupted(f"stopped at step {step}; {way}")
+        progress(step, options.steps, note, loss=average)
     return field
 
 

@@ -2,6 +2,7 @@
 
 ```
 run/  options.json  run.json  seeds.json  log.jsonl  avatar.safetensors  .lock  .handavatar
+      {geometry,samples,detail}.unfinished[.stage].safetensors
       checkpoints/step-000001000/{model,optimizer}.safetensors  state.json  MANIFEST.json
       corrupt/  evaluation/  renders/
 ```
@@ -71,6 +72,8 @@ def _is_older_run(folder: Path) -> bool:
     return {"schema", "versions", "seed", "capture", "command"} <= facts.keys()
 
 
+UNFINISHED_STAGES = ("geometry.unfinished", "samples.unfinished", "detail.unfinished")
+"""Files of a run, without their endings, in which stages between checkpoints keep their state."""
 RUN = FolderKind("run", is_older=_is_older_run)
 """The folder that :func:`create_run` makes."""
 

@@ -23,6 +23,7 @@ from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.plain import plain_rays
 from handavatar.train.labelled_poses import LabelledPose, PoseStream
 from handavatar.train.loop import learned_rays
@@ -87,21 +88,19 @@ class PatchCost:
     gradients: dict[str, Tensor]
 
 
-def training_table(
-    options: TrainingTableOptions, report: Callable[[int], None] | None = None
-) -> ResultTable:
+def training_table(options: TrainingTableOptions, progress: Progress = SILENT) -> ResultTable:
     """Measures a patch and a step of pre-training, each in the plain way and in ours.
 
     Args:
         options: what to measure.
-        report: told the number of pieces of work done.
+        progress: told the number of pieces of work done.
 
     Raises:
         CheckpointError: if the avatar cannot be read.
         ArgumentError: if the patch does not fit, or has fewer rays than the plain way shall take.
     """
     require_range("plain_rays", options.plain_rays, 1, options.patch**2)
-    finished = step_counter(report)
+    finished = step_counter(progress, options.total_steps)
     rows = _patch_rows(options, finished)
     plain, ours = _step_seconds(options, finished)
     rows["pre-training step, plain"] = {"s": round(plain, 3), "ratio": 1.0, **_NOTHING}

@@ -13,11 +13,12 @@ from typing import Literal
 from handavatar.avatar import HandAvatar
 from handavatar.errors import require_ranges
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.signals import awaited_signals
 from handavatar.tracker.model import shipped_tracker
 from handavatar.view.driven import DrivenAvatar
 from handavatar.view.guard import Guard
 from handavatar.view.recording import RecordingFile
-from handavatar.view.server import PageServer, checked_guard, greet, serving, stopping
+from handavatar.view.server import PageServer, checked_guard, greet, serving
 from handavatar.view.webcam_answers import WebcamAnswers
 from handavatar.webcam.session import LiveSession
 
@@ -113,7 +114,7 @@ def record_webcam(options: WebcamOptions) -> Path | None:
     answers = webcam_answers(options)
     server = WebcamServer(answers, guard, options.port)
     greet(server, options.port)
-    with stopping() as is_stopped, serving(server):
+    with awaited_signals() as is_stopped, serving(server):
         if options.out is None:
             print("the avatar follows the hand; Ctrl-C ends it", flush=True)
         else:
