@@ -567,7 +567,7 @@ def test_a_failed_save_leaves_the_old_file(
     def disk_full(*_: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr("handavatar.avatar.save_file", disk_full)
+    monkeypatch.setattr("os.fsync", disk_full)
     with pytest.raises(OSError, match="disk full"):
         small_avatar.save(file)
     assert file.read_bytes() == before
