@@ -25,6 +25,7 @@ from handavatar.fit.register import Registered, RegisterOptions, register
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.rig import Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
+from handavatar.jobs.memory import tidy
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.stage_states import NOT_KEPT, StageState
 
@@ -222,7 +223,7 @@ def register_frames(
     )
     return register(
         hands,
-        [observe_frame(frame) for frame in frames],
+        [observe_frame(frame) for frame in tidy(frames)],
         tracked,
         information,
         options,

@@ -47,6 +47,7 @@ from handavatar.capture.frames import (
 from handavatar.geometry.cameras import project
 from handavatar.hand.rig import RigError, ShapedHand
 from handavatar.hand.rigs import find_rig
+from handavatar.jobs.memory import tidy
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.threads import one_thread
 from handavatar.render.rasterize import covered_pixels
@@ -216,7 +217,7 @@ def _problems_of_frames(
     stride = -(-count * side**2 // _MOST_PIXELS)
     seen: list[_Seen] = []
     with one_thread():
-        for index, record in enumerate(capture.records):
+        for index, record in enumerate(tidy(capture.records)):
             try:
                 frame = capture.frame(index)
                 frame.require_finite()

@@ -16,6 +16,7 @@ from handavatar.avatar import HandAvatar, RenderSettings
 from handavatar.capture.frames import Frame
 from handavatar.field.anchors import Neighbours
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
+from handavatar.jobs.memory import tidy
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.stage_states import NOT_KEPT, StageState, WorkState, named_tensors
 from handavatar.render.volume import composite_sparse
@@ -108,7 +109,7 @@ def find_seen_samples(
         return WorkState(parts, {"frames": len(pieces)})
 
     with kept.kept(state):
-        for number in range(len(pieces), len(frames)):
+        for number in tidy(range(len(pieces), len(frames))):
             pieces.append(_seen_in_frame(avatar, frames[number], number, settings, stride))
             progress(number + 1, len(frames))
     joined = {name: torch.cat([piece[name] for piece in pieces]) for name in pieces[0]}

@@ -30,6 +30,7 @@ from handavatar.geometry.meshes import SurfacePoints, is_inside
 from handavatar.geometry.rotations import mean_rotation
 from handavatar.hand.rigs import find_rig
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
+from handavatar.jobs.memory import tidy
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.signals import Interrupted, heard_signals, stop_point, unbroken
 from handavatar.jobs.stage_states import (
@@ -479,7 +480,7 @@ def training_frames(
         return frame if method.picture_size is None else frame.binned(method.picture_size)
 
     frames = FrameSequence(read, len(indices))
-    for number, frame in enumerate(frames):
+    for number, frame in enumerate(tidy(frames)):
         progress(number, len(frames))
         frame.require_finite()
     return frames
