@@ -11,8 +11,10 @@ EVERYTHING_BELOW = (
     "alignment animate evaluate train peers export view webcam demo doctor synthetic bench tracker"
 )
 MAY_IMPORT = {
-    name: set(allowed.split())
+    name: {"errors", *allowed.split()}
     for name, allowed in {
+        # What users can cause, and how it is said.
+        "errors": "",
         "geometry": "",
         # Files and folders of a long command; knows no hand.
         "jobs": "",

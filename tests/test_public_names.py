@@ -30,6 +30,10 @@ EXACTLY = {
     ),
     "hand.rigs": "SCHEMA find_rig load_mano load_rig read_rig rigs_folder save_rig",
     "hand.detail": "refined subdivided",
+    "errors": (
+        "ARGUMENT_MARK ArgumentError ErrorKind HandAvatarError OutOfSpace PlaceRefused SEEDS "
+        "argument machine_error raise_if_refused require_range require_ranges"
+    ),
     "edit": "Edit Paint bones_named",
     "avatar": (
         "CheckpointError EXACT HandAvatar HandState RayValues RenderSettings Rendering "

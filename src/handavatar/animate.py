@@ -23,6 +23,7 @@ from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chos
 from handavatar.capture.motion import gesture, open_motion
 from handavatar.capture.view import camera_holding, start_of
 from handavatar.edit import Edit
+from handavatar.errors import ArgumentError, require_ranges
 from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.colors import eight_bits
@@ -93,6 +94,13 @@ class RenderOptions(Look):
     device: str = "auto"
     kernel: Kernel = "auto"
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        super().__post_init__()
+        require_ranges(
+            self, size=(2, 8192), frames=(1, 10**5), num_samples=(1, 4096), check=(0, 10**6)
+        )
+
 
 def render_motion(options: RenderOptions, progress: Progress = SILENT) -> Path:
     """Renders a motion: one PNG per frame and pass, and one video per pass.
@@ -109,24 +117,16 @@ def render_motion(options: RenderOptions, progress: Progress = SILENT) -> Path:
     Raises:
         CheckpointError: if the avatar cannot be read.
         CaptureError: if the motion cannot be read.
-        ValueError: for a pass or an edit that does not exist.
+        ArgumentError: for a pass or an edit that does not exist.
         FolderInUse: if ``out`` holds something that may not be replaced.
     """
-    for flag, value, least in (
-        ("--size", options.size, 2),
-        ("--frames", 1 if options.frames is None else options.frames, 1),
-        ("--num-samples", options.num_samples, 1),
-        ("--check", options.check, 0),
-    ):
-        if value < least:
-            raise ValueError(f"{flag} {value}: expected at least {least}")
     passes = tuple(word.strip() for word in options.passes.split(",") if word.strip())
     if not passes:
-        raise ValueError(f"--passes: none given; choose from {', '.join(PASSES)}")
+        raise ArgumentError("passes", f"none given; choose from {', '.join(PASSES)}")
     for name in passes:
         if name not in PASSES:
-            raise ValueError(
-                f"--passes: there is no pass '{name}'; choose from {', '.join(PASSES)}"
+            raise ArgumentError(
+                "passes", f"there is no pass '{name}'; choose from {', '.join(PASSES)}"
             )
     options.check_look()
     inputs = [options.run, *files_named(options.motion, options.paint)]

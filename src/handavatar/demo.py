@@ -15,6 +15,7 @@ from handavatar.animate import PICTURES, RenderOptions, pass_pictures, render_mo
 from handavatar.avatar import HandAvatar
 from handavatar.capture.default import default_capture
 from handavatar.edit import Edit, bones_named
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.evaluate.run import EvaluateOptions, evaluate_run
 from handavatar.jobs.files import (
     FolderInUse,
@@ -57,6 +58,10 @@ class DemoOptions:
     size: int = 128
     device: Literal["auto", "cpu", "cuda"] = "auto"
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, steps=(1, 10**8), frames=(1, 10_000), size=(2, 4096), seed=SEEDS)
 
 
 def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:

@@ -123,5 +123,5 @@ def test_every_video_has_its_own_masks_and_camera() -> None:
         ((Path("m"),), (Path("c"),)),
         ((Path("n"),), (Path("d"),)),
     ]
-    with pytest.raises(ValueError, match="--masks names 1, expected one for each of 2 videos"):
+    with pytest.raises(ValueError, match="`masks`: found 1, expected one for each of 2 videos"):
         replace(options, masks=(Path("m"),)).of_each_clip()

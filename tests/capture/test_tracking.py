@@ -80,7 +80,7 @@ def test_two_hands_all_along_are_refused(monkeypatch: pytest.MonkeyPatch) -> Non
     _install(monkeypatch, {i: both for i in range(4)})
     with pytest.raises(UnusableTrackError, match="two hands in 4 of 20") as caught:
         track_hand(_frames(20))
-    assert "--hand left" in caught.value.remedy
+    assert "`hand='left'`" in caught.value.remedy
     assert len(caught.value.track.hands) == 16 and len(caught.value.track.skipped) == 4
 
 

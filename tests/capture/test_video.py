@@ -94,7 +94,7 @@ def test_both_hands_are_two_captures() -> None:
     ]
     alone = replace(options, hand="larger")
     assert alone.of_each_hand() == [alone]
-    with pytest.raises(ValueError, match="--hand both makes two captures"):
+    with pytest.raises(ValueError, match="`hand`: both makes two captures"):
         track_video(options)
 
 
@@ -133,7 +133,7 @@ def test_a_hand_wholly_in_the_picture_is_kept_and_known(
     assert sum(split["pictures"] for split in summary["splits"].values()) == _MADE
     assert summary["border"]["frames"] == 0
     lines = summary_lines(summary)
-    assert "--side left overrules it" in lines[0]
+    assert "`side='left'` overrules it" in lines[0]
     assert lines[1] == f"frames: {_MADE} of {_MADE} kept"
     frame = capture.frame(0)
     # All but the cut across the wrist.

@@ -62,7 +62,7 @@ def test_the_open_hand_alone_has_levels(model: ManoModel, home: Path) -> None:
         assert load_rig(reference, "778").sha256 == small
     assert load_rig("mano-right", "full").sha256 == model.rig.sha256
     for reference in ("mano-right", str(path)):
-        with pytest.raises(RigError, match=r"found level 778, which the open hand[\s\S]*--level"):
+        with pytest.raises(RigError, match=r"found level 778, which the open hand[\s\S]*`level`"):
             load_rig(reference, "778")
 
 

@@ -92,18 +92,18 @@ def test_a_training_that_diverges_keeps_the_last_good_state_and_says_how_to_go_o
     spoiling(1)
     with pytest.raises(NotFinite, match=r"step 1: network\.verdict\.bias holds NaN") as caught:
         train_made_tracker(options)
-    assert str(caught.value).endswith("give the same command again with --rate 0.001")
+    assert str(caught.value).endswith("give the same command again with `rate=0.001`")
     spoiling(4)  # The last one.
     with pytest.raises(NotFinite, match=r"t\.state holds step 3, which is good") as caught:
         train_made_tracker(options)
-    assert str(caught.value).endswith("--resume --rate 0.001")
+    assert str(caught.value).endswith("`resume=True` `rate=0.001`")
     assert not options.out.exists()
     monkeypatch.setattr(TrackerTraining, "teach", teach)
     train_made_tracker(replace(options, resume=True, rate=0.001))
     assert find_not_finite(read_tracker(options.out).network.state_dict()) is None
     state_file = options.out.with_suffix(".state")
     save_file(load_file(state_file) | {"network.verdict.bias": torch.full((2,), -inf)}, state_file)
-    with pytest.raises(CaptureError, match=r"verdict\.bias holds -inf(.|\n)*without --resume"):
+    with pytest.raises(CaptureError, match=r"verdict\.bias holds -inf(.|\n)*without `resume=True`"):
         train_made_tracker(replace(options, resume=True, steps=5))
 
 

@@ -198,5 +198,5 @@ def test_some_rows_of_a_capture_without_truth_and_then_more(
     assert table.rows["traced light, poses corrected (best)"] == table.rows["traced light"]
     assert trainings == [ROWS["traced light"]]
     assert ablation_table(replace(options, rows=("(paper)",))) == first
-    with pytest.raises(ValueError, match="--rows sunlight: no row"):
+    with pytest.raises(ValueError, match="`rows`: no row is called sunlight"):
         ablation_table(replace(options, rows=("sunlight",)))

@@ -229,7 +229,7 @@ def test_a_named_checkpoint_cut_in_half_is_a_clear_error(tmp_path: Path) -> None
     with pytest.raises(CheckpointError) as caught:
         load_checkpoint(checkpoint)
     message = str(caught.value)
-    assert "model.safetensors" in message and "--resume auto" in message
+    assert "model.safetensors" in message and "`resume='auto'`" in message
     assert len(message.splitlines()) <= 6
 
 

@@ -62,6 +62,7 @@ from handavatar.capture.video import (
     capture_video,
     track_video,
 )
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.geometry.cameras import Camera
@@ -107,6 +108,7 @@ class RegistrationTableOptions:
 
     def __post_init__(self) -> None:
         """Refuses cases and rows that there are not."""
+        require_ranges(self, seeds=SEEDS)
         for case in self.cases:
             if case != "video" and not _NOISE_CASE.fullmatch(case):
                 raise CaptureError(

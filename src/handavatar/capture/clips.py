@@ -389,7 +389,7 @@ def _with_unit(clip: Clip, fitted: FittedHands) -> Clip:
     unit = metres_of_unit(clip.camera_from_world, fitted.vertices.mean(1))
     note = (
         f"the unit of the cameras' positions was taken as {unit:.4g} m: so the hand moves least "
-        "(--camera-unit says otherwise)"
+        "(`camera_unit` says otherwise)"
     )
     track = replace(clip.track, notes=(*clip.track.notes, note))
     return replace(clip, track=track, unit=unit)

@@ -15,9 +15,9 @@ import torch
 from PIL import Image, ImageFilter
 from scipy.ndimage import binary_erosion
 
-from handavatar.capture.checks import CaptureError
 from handavatar.capture.frames import Capture, CaptureWriter, Frame, read_capture
 from handavatar.capture.motion import Motion, write_motion
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
 from handavatar.jobs.progress import SILENT, Progress
@@ -55,19 +55,15 @@ class DegradeOptions:
 
     def __post_init__(self) -> None:
         """Refuses what would make a capture better, or nothing of it."""
-        limits = {
-            "pose_noise": (0, 45),
-            "pose_noise_correlation": (0, 3600),
-            "mask_erosion": (0, 64),
-            "blur": (0, 32),
-            "jpeg": (1, 100),
-        }
-        for name, (least, most) in limits.items():
-            if not least <= getattr(self, name) <= most:
-                raise CaptureError(
-                    f"{name} is {getattr(self, name)}, expected {least} to {most}",
-                    "choose a value between",
-                )
+        require_ranges(
+            self,
+            pose_noise=(0, 45),
+            pose_noise_correlation=(0, 3600),
+            mask_erosion=(0, 64),
+            blur=(0, 32),
+            jpeg=(1, 100),
+            seed=SEEDS,
+        )
 
 
 def degrade_capture(

@@ -41,6 +41,7 @@ from handavatar.capture.checks import (
     path_inside,
     text_field,
 )
+from handavatar.errors import raise_if_refused
 from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.rotations import invert_rigid
@@ -410,6 +411,7 @@ class Capture:
             tensors = load_file(path)
             found = {name: tensors[name].float() for name in shapes}
         except (SafetensorError, KeyError, OSError) as error:
+            raise_if_refused(error)
             raise CaptureError(f"{file} cannot be read ({error})", _MAKE_AGAIN) from error
         for name, shape in shapes.items():
             values = found[name]

@@ -252,7 +252,7 @@ def evenly_spaced(
     count = int(float(times[-1] - times[0]) * fps + 1e-6) + 1
     if count > MAX_STEPS:
         raise CaptureError(
-            f"{count} steps at {fps:g} a second; {MAX_STEPS} at most", "choose a smaller --fps"
+            f"{count} steps at {fps:g} a second; {MAX_STEPS} at most", "choose a smaller `fps`"
         )
     if len(times) == 1:
         return Motion(fps, axis_angle_from_matrix(rotations).float(), translations.float())

@@ -18,6 +18,7 @@ from handavatar.capture.motion_files.trackers import is_hawor
 from handavatar.capture.motion_values import MAX_STEPS
 from handavatar.capture.tracking import has_mediapipe
 from handavatar.capture.video import VideoOptions, capture_video
+from handavatar.errors import require_ranges
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import refuse_file_in_use
@@ -61,6 +62,10 @@ class MotionFromOptions:
     """True focal length in pixels of the pictures that HaMeR or WiLoR saw, for their depths."""
     overwrite: bool = False
     """Replace a file at OUT."""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, fps=(0.001, 1000), focal=(1, 1e6))
 
 
 def motion_from(

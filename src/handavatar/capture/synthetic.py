@@ -36,7 +36,6 @@ from torch import Tensor
 
 from handavatar.capture.frames import (
     Capture,
-    CaptureError,
     CaptureWriter,
     Frame,
     read_capture,
@@ -53,6 +52,7 @@ from handavatar.capture.pathtracer import (
     choose_variant,
 )
 from handavatar.capture.skin import SkinOptions, paint_skin, smooth_noise
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.geometry.cameras import Camera, look_at, project
 from handavatar.geometry.colors import eight_bits, srgb_from_linear
 from handavatar.geometry.meshes import uniform_laplacian, unique_edges, vertex_normals
@@ -138,14 +138,19 @@ class SynthOptions:
 
     def __post_init__(self) -> None:
         """Refuses what cannot be rendered."""
-        leasts = {"train_frames": 1, "test_frames": 1, "size": 8, "samples": 1, "test_views": 1}
-        for name, least in leasts.items():
-            if getattr(self, name) < least:
-                raise CaptureError(
-                    f"{name} is {getattr(self, name)}, expected at least {least}", f"raise {name}"
-                )
-        if not 0 <= self.tone <= 1:
-            raise CaptureError(f"tone is {self.tone:g}, expected 0 to 1", "choose a tone between")
+        require_ranges(
+            self,
+            train_frames=(1, 10**5),
+            test_frames=(1, 10**5),
+            size=(8, 4096),
+            samples=(1, 65_536),
+            seed=SEEDS,
+            tone=(0, 1),
+            personal=(0, 10),
+            subdivisions=(0, 4),
+            texture=(1, 8192),
+            test_views=(1, 1000),
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -550,7 +550,7 @@ def _check_found(track: Track) -> None:
     if num_double > _MAX_SHARE_OF_TWO_HANDS * total:
         raise UnusableTrackError(
             f"two hands in {num_double} of {total} pictures; expected one",
-            "choose one with --hand left, --hand right or --hand larger, or record one alone",
+            "choose one with `hand='left'`, `hand='right'` or `hand='larger'`, or record one alone",
             track,
         )
     if len(track.hands) < _MIN_FRAMES:
@@ -585,7 +585,7 @@ def _mediapipe_hands() -> Any:
     except ImportError as error:
         raise CaptureError(
             f"the hand tracker cannot be loaded ({error})",
-            "choose --tracker own, which needs no other package, or pip install "
+            "choose `tracker='own'`, which needs no other package, or pip install "
             "'handavatar[video]' (mediapipe 0.10.14: newer ones have no hand models)",
         ) from error
     return Hands

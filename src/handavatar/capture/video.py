@@ -48,6 +48,7 @@ from handavatar.capture.video_report import (
     too_few,
     with_common_gain,
 )
+from handavatar.errors import ArgumentError, require_ranges
 from handavatar.fit.energy import VIDEO_TEXTURE_SHARE, EnergyOptions
 from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.rotations import mirror_rigid
@@ -121,6 +122,11 @@ class VideoOptions:
     )
     """How the hand is laid onto masks and texture."""
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, camera_unit=(1e-6, 1e6), size=(16, 4096), min_confidence=(0, 1))
+        self.sampling()  # Refuses what selects nothing.
+
     def sampling(self) -> Sampling:
         """Which pictures of the video are taken.
 
@@ -133,14 +139,12 @@ class VideoOptions:
         """One for every video, of itself alone.
 
         Raises:
-            ValueError: masks or cameras are given for some of the videos only.
+            ArgumentError: masks or cameras are given for some of the videos only.
         """
         files = (self.file, *self.more)
         for name, given in (("masks", self.masks), ("camera", self.camera)):
             if given and len(given) != len(files):
-                raise ValueError(
-                    f"--{name} names {len(given)}, expected one for each of {len(files)} videos"
-                )
+                raise ArgumentError(name, str(len(given)), f"one for each of {len(files)} videos")
         return [
             replace(
                 self,
@@ -191,10 +195,9 @@ def capture_video(
     stages = progress.stages(
         {"finding the hand": 40.0, "laying the hand": 50.0, "cropping": 5.0, "writing": 5.0}
     )
-    options.sampling()  # Refuses what selects nothing, before any work.
     videos = options.of_each_clip()
     if len(videos) > MAX_CLIPS:
-        raise ValueError(f"{len(videos)} videos, at most {MAX_CLIPS} of one hand")
+        raise ArgumentError("more", f"{len(videos)} videos", f"at most {MAX_CLIPS} of one hand")
     cameras = [read_camera(video.camera[0]) if video.camera else None for video in videos]
     rig = rig or load_rig(options.rig)
     header = _header(options, rig)
@@ -286,7 +289,7 @@ def _check_one_side(clips: Sequence[TriedClip]) -> None:
         sides = ", ".join(f"{clip.file}: {clip.track.side}" for clip in clips)
         raise CaptureError(
             f"the videos show two hands ({sides})",
-            "give videos of one hand, or name its side with --side",
+            "give videos of one hand, or name its side with `side`",
         )
 
 
@@ -339,7 +342,9 @@ class _Tracked:
 
 def _tracked(options: VideoOptions, camera: KnownCamera | None, progress: Progress) -> _Tracked:
     if options.hand == "both":
-        raise ValueError("--hand both makes two captures: ask for one of VideoOptions.of_each_hand")
+        raise ArgumentError(
+            "hand", "both makes two captures: ask for one of VideoOptions.of_each_hand"
+        )
     notes: list[str] = []
     is_own = options.tracker == "own" or (options.tracker == "auto" and not has_mediapipe())
     if is_own and options.tracker == "auto":

@@ -289,7 +289,7 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     sure = round(100 * summary["side_votes"])
     lines = [
         *(f"note: {note}" for note in summary.get("notes", [])),
-        f"hand: {summary['side']} ({sure} % of the tracker's votes; --side {other} overrules it)",
+        f"hand: {summary['side']} ({sure} % of the tracker's votes; `side={other!r}` overrules it)",
         f"frames: {summary['kept']} of {summary['pictures']} kept",
     ]
     for kind, count in summary["left_out"].items():

@@ -5,6 +5,7 @@ options are a dataclass beside the code it serves; its summary here is its docst
 """
 
 import difflib
+import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -12,7 +13,7 @@ from io import TextIOWrapper
 
 from handavatar import __version__
 from handavatar.cli import avatar, bench, capture, default, motion, prior, rig, tracker
-from handavatar.cli.failures import USAGE, report_failure
+from handavatar.cli.failures import USAGE, WarningsShown, report_failure
 from handavatar.jobs.progress import Progress, shown_progress
 from handavatar.jobs.signals import heard_signals
 
@@ -67,6 +68,9 @@ def _run(words: list[str]) -> int:
         # Names of files may hold what is no character: shown as codes, never an error.
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    log = logging.getLogger("handavatar")
+    if not any(isinstance(handler, WarningsShown) for handler in log.handlers):
+        log.addHandler(WarningsShown())
     is_debugging = "--debug" in words
     # Of the processes that torchrun starts, the first one reports.
     is_quiet = "--quiet" in words or os.environ.get("RANK", "0") != "0"

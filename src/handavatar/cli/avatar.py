@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from handavatar.errors import ArgumentError
 from handavatar.jobs.progress import Progress
 
 if TYPE_CHECKING:
@@ -19,7 +20,9 @@ def train(words: list[str], progress: Progress) -> int:
 
     page = (
         Extra("view", bool, "a page shows the training, and afterwards the avatar", False),
-        Extra("port", int, "of the page; if it is taken, the next free one", 7007),
+        Extra(
+            "port", int, "of the page; if it is taken, the next free one", 7007, least=0, most=65535
+        ),
         Extra("host", str, "where the page listens, as for view", "127.0.0.1"),
         Extra("token", str, "who does not know it does not see the page, as for view", ""),
     )
@@ -29,7 +32,7 @@ def train(words: list[str], progress: Progress) -> int:
         return _train_in_view(options, run_folder(options), extras, progress)
     for extra in page:
         if extras[extra.name] != extra.default:
-            raise ValueError(f"--{extra.name}: only with --view")
+            raise ArgumentError(extra.name, "only with `view=True`")
     with progress:
         run = train_avatar(options, progress)
     _say_trained(run)

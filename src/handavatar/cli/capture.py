@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from handavatar.cli.failures import BAD_DATA, printable
+from handavatar.cli.failures import BAD_DATA, shown
+from handavatar.errors import ArgumentError
 from handavatar.jobs.progress import Progress, shown_progress
 
 if TYPE_CHECKING:
@@ -52,7 +53,9 @@ def webcam(words: list[str], progress: Progress) -> int:
             "run folder or file of an avatar, which follows the hand beside the camera's picture",
             None,
         ),
-        Extra("port", int, "of the page; if it is taken, the next free one", 7007),
+        Extra(
+            "port", int, "of the page; if it is taken, the next free one", 7007, least=0, most=65535
+        ),
         Extra("host", str, "where the page listens, as for view", "127.0.0.1"),
         Extra("token", str, "who does not know it does not see the page, as for view", ""),
     )
@@ -87,7 +90,7 @@ def _record(options: "VideoOptions", values: dict[str, Any]) -> Path | None:
 
     out, drive = values["out"], values["drive"]
     if out is None and drive is None:
-        raise ValueError("--out: say where the capture is to be, or --drive an avatar")
+        raise ArgumentError("out", "say where the capture is to be, or `drive` an avatar")
     sampling = options.sampling()
     longest = sampling.wanted(sampling.max_frames)
     if sampling.end is not None:
@@ -116,10 +119,10 @@ def _say_captured(options: "VideoOptions") -> None:
 
     skipped = json.loads((options.out / "skipped.json").read_text(encoding="utf-8"))
     for name, reason in skipped["frames"].items():
-        print(f"skipped {name}: {reason}")
+        print(shown(f"skipped {name}: {reason}"))
     fit = json.loads((options.out / "fit.json").read_text(encoding="utf-8"))
     for line in summary_lines(fit["summary"]):
-        print(line)
+        print(shown(line))
     print(f"look at: {options.out / 'overview.png'}")
     print(f"capture: {options.out}\nnext: handavatar train {options.out}")
 
@@ -195,6 +198,6 @@ def check(words: list[str], progress: Progress) -> int:
         print_json({"sound": not problems, "problems": [vars(problem) for problem in problems]})
     else:
         for problem in problems:
-            print(printable(str(problem)))
+            print(shown(str(problem)))
         print(f"{options.capture}: {f'{len(problems)} problems' if problems else 'sound'}")
     return BAD_DATA if problems else 0

@@ -1,6 +1,6 @@
 """``handavatar motion``: motions that drive avatars."""
 
-from handavatar.cli.failures import printable
+from handavatar.cli.failures import shown
 from handavatar.jobs.progress import Progress
 
 
@@ -17,7 +17,7 @@ def from_source(words: list[str], progress: Progress) -> int:
         motion = motion_from(options, notes.append, progress)
     write_motion(options.out, motion)
     for note in notes:
-        print(printable(f"note: {note}"))
+        print(shown(f"note: {note}"))
     print(f"motion: {options.out}, {len(motion)} steps at {motion.fps:.4g} a second")
     print(f"next: handavatar render RUN --motion {options.out}")
     return 0

@@ -35,8 +35,17 @@ def evaluate(words: list[str], progress: Progress) -> int:
     from handavatar.train.prior_measures import measure_prior_file
 
     extras_wanted = (
-        Extra("meshes", int, "extract meshes of so many unseen poses and fists as well", 0),
-        Extra("resolution", int, "cells along the longest side of their box", 128),
+        Extra(
+            "meshes",
+            int,
+            "extract meshes of so many unseen poses and fists as well",
+            0,
+            least=0,
+            most=10**5,
+        ),
+        Extra(
+            "resolution", int, "cells along the longest side of their box", 128, least=2, most=1024
+        ),
         JSON,
     )
     options, extras = parse_with(

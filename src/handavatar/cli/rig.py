@@ -127,7 +127,7 @@ def refine(words: list[str], progress: Progress) -> int:
     extras_wanted = (
         Extra("out", Path, "file to write (safetensors)", Path("skin.safetensors")),
         Extra("level", Level, "full is the default rig, 778 the one of MANO's size", "full"),
-        Extra("rounds", int, "midpoint subdivisions", 2),
+        Extra("rounds", int, "midpoint subdivisions", 2, least=0, most=4),
         Extra("resume", bool, "continue from OUT.part, which a stopped run has left", False),
         JSON,
         OVERWRITE,

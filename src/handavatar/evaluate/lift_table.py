@@ -16,6 +16,7 @@ from handavatar.capture.checks import CaptureError, load_json
 from handavatar.capture.frames import Capture, Frame, read_capture
 from handavatar.capture.synthetic import Subject, SynthOptions, lifted_truths, make_subject
 from handavatar.edit import Edit, bones_named
+from handavatar.errors import require_ranges
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.metrics import psnr
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
@@ -46,6 +47,10 @@ class LiftTableOptions:
     lift: tuple[str, ...] = ("thumb", "middle+ring")
     frames: int = 8
     samples: int = 144
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, frames=(1, 10**5), samples=(1, 65_536))
 
     @property
     def total_steps(self) -> int:

@@ -25,6 +25,7 @@ from handavatar.capture.frames import (
 from handavatar.capture.registration import poses_of as registered_poses
 from handavatar.capture.registration import register_frames
 from handavatar.edit import Edit
+from handavatar.errors import require_ranges
 from handavatar.evaluate.baselines import judged_frame, textured_mesh_psnr, training_color
 from handavatar.evaluate.figures import protocol_figures
 from handavatar.evaluate.metrics import (
@@ -89,6 +90,10 @@ class EvaluateOptions:
     full_size: bool = False
     device: str = "auto"
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, max_frames=(1, 10**6))
+
 
 @dataclass(frozen=True, eq=False)
 class _Protocol:
@@ -129,7 +134,7 @@ def evaluate_run(options: EvaluateOptions, progress: Progress = SILENT) -> dict[
     if not indices:
         raise CaptureError(
             f"{capture.folder}: no frame of split {options.split!r}",
-            "name another split with --split",
+            "name another split with `split`",
         )
     clips = {capture.records[index].clip for index in indices}
     if max(clips) >= avatar.num_lights:
@@ -242,7 +247,7 @@ def _opened(options: EvaluateOptions) -> tuple[HandAvatar, Capture, Path]:
     else:
         folder = options.capture
         if folder is None:
-            raise CaptureError(f"{run}: a file alone names no capture", "name one with --capture")
+            raise CaptureError(f"{run}: a file alone names no capture", "name one with `capture`")
         avatar = HandAvatar.load(run)
         out = options.out or run.parent / f"{run.stem}-evaluation"
     return avatar, read_capture(folder), out
@@ -284,7 +289,7 @@ def _measured(
     if frames[0].camera.width != stored:
         notes.append(
             f"judged at {frames[0].camera.width} pixels along a side, of {stored} that the capture "
-            "stores; --full-size judges these"
+            "stores; `full_size` judges these"
         )
     times = torch.tensor([frame.time for frame in frames], dtype=torch.float64)
     figures = {

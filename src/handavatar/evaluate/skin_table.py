@@ -12,6 +12,7 @@ from jaxtyping import Float
 from scipy import stats
 from torch import Tensor
 
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.evaluate.tables import Cell, ResultTable
 from handavatar.geometry.meshes import distance_to_mesh, uniform_laplacian, unique_edges
 from handavatar.hand.detail import refined
@@ -55,6 +56,17 @@ class SkinTableOptions:
     refit_steps: int = 50
     poses: int = 100
     seeds: tuple[int, ...] = (0, 1, 2)
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            rounds=(0, 4),
+            steps=(0, 10**7),
+            refit_steps=(0, 10**7),
+            poses=(1, 10**5),
+            seeds=SEEDS,
+        )
 
     @property
     def total_steps(self) -> int:

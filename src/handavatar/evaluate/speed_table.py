@@ -32,6 +32,7 @@ from handavatar.avatar import (
     RenderSettings,
     chosen_device,
 )
+from handavatar.errors import require_range, require_ranges
 from handavatar.evaluate.published_coap import published_coap_query
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.geometry.cameras import (
@@ -95,6 +96,18 @@ class SpeedTableOptions:
     hands: tuple[int, ...] = (1, 2, 4, 8)
     device: str = "auto"
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            size=(2, 4096),
+            poses=(1, len(GESTURES)),
+            plain_rays=(1, 4096**2),
+            plain_points=(1, 10**6),
+            sizes=(2, 4096),
+            hands=(1, 64),
+        )
+
     @property
     def total_steps(self) -> int:
         """Pictures and the choice of the reference's pieces."""
@@ -132,12 +145,7 @@ def speed_table(options: SpeedTableOptions, progress: Progress = SILENT) -> Resu
         CheckpointError: if the avatar cannot be read.
         ValueError: if there are fewer rays or poses than can be chosen.
     """
-    if not 1 <= options.poses <= len(GESTURES):
-        raise ValueError(f"--poses: found {options.poses}, expected 1 to {len(GESTURES)}")
-    if not 1 <= options.plain_rays <= options.size**2:
-        raise ValueError(
-            f"--plain-rays: found {options.plain_rays}, expected 1 to {options.size**2}"
-        )
+    require_range("plain_rays", options.plain_rays, 1, options.size**2)
     device = chosen_device(options.device)
     ways = _ways(device)
     avatar = HandAvatar.load(options.avatar).moved_to(device)

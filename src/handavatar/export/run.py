@@ -12,6 +12,7 @@ from handavatar.avatar import HandAvatar
 from handavatar.capture.motion import Motion, gesture, open_motion
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
+from handavatar.errors import ArgumentError, require_ranges
 from handavatar.export.baking import baked_textures, colors_at_vertices
 from handavatar.export.gltf import glb_bytes
 from handavatar.export.lightweight import lightweight_hand
@@ -67,6 +68,11 @@ class ExportOptions(Look):
     unlit: bool = False
     overwrite: bool = False
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        super().__post_init__()
+        require_ranges(self, texture_size=(16, MAX_TEXTURE))
+
 
 def export_avatar(options: ExportOptions, progress: Progress = SILENT) -> Path:
     """Writes the files, aside first.
@@ -106,19 +112,18 @@ def _check(options: ExportOptions) -> None:
     """Refuses what contradicts itself, before anything is read."""
     if options.format == "web":
         if options.pose != "flat" or options.unlit:
-            raise ValueError("--pose, --unlit: a page begins in the capture's pose, and is lit")
+            name = "pose" if options.pose != "flat" else "unlit"
+            raise ArgumentError(name, "a page begins in the capture's pose, and is lit")
         refuse_folder_in_use(options.out, WEB_PAGE, options.overwrite, _inputs(options))
         return
     if options.out.suffix.lower() != f".{options.format}":
-        raise ValueError(f"--out {options.out}: expected a name that ends in .{options.format}")
-    if not 16 <= options.texture_size <= MAX_TEXTURE:
-        raise ValueError(
-            f"--texture-size {options.texture_size}: expected 16 to {MAX_TEXTURE} texels"
-        )
+        raise ArgumentError("out", str(options.out), f"a name that ends in .{options.format}")
     if options.format == "glb" and options.pose != "flat":
-        raise ValueError("--pose: a GLB is in its rest pose; animate it with --motion")
+        raise ArgumentError("pose", "a GLB is in its rest pose; animate it with `motion`")
     if options.format != "glb" and options.motion is not None:
-        raise ValueError(f"--motion: {options.format.upper()} cannot move; choose glb, or --pose")
+        raise ArgumentError(
+            "motion", f"{options.format.upper()} cannot move; choose glb, or `pose`"
+        )
     for path in _files(options):
         refuse_file_in_use(path, options.overwrite)
 

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.fit.appearance import SkinTexture, fit_texture, look_up_points
 from handavatar.fit.contact import fill_with_balls
 from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
@@ -83,6 +84,19 @@ class RegisterOptions:
     """Of the poses to begin anew from."""
     energy: EnergyOptions = field(default_factory=EnergyOptions)
     """Expected errors of what is observed."""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            pose_error=(0.01, 180),
+            tilts=(0, 180),
+            restarts=(0, 1000),
+            texture_sigmas=(0.1, 100),
+            texture_rounds=(0, 1000),
+            coefficient_sigma=(1e-3, 10),
+            seed=SEEDS,
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ from pathlib import Path
 from safetensors import SafetensorError
 from safetensors import torch as safetensors_torch
 
+from handavatar.errors import raise_if_refused
 from handavatar.hand.mano import LICENCE, WHERE_TO_GET_IT, ManoModel, read_mano
 from handavatar.hand.open_hand import Level, load_open_hand
 from handavatar.hand.rig import RIG_ARRAYS, LicensedRigMissing, Rig, RigError
@@ -86,6 +87,7 @@ def read_rig(path: Path) -> Rig:
             **{name: arrays[name] for name in _TENSORS},
         )
     except (KeyError, OSError, SafetensorError, RigError, RuntimeError) as error:
+        raise_if_refused(error)
         raise RigError(f"{path}: not a whole rig ({error})\nimport it again") from error
     if rig.sha256 != facts["sha256"]:
         raise RigError(
@@ -114,8 +116,9 @@ def load_rig(reference: str, level: Level = "full") -> Rig:
         return load_open_hand("778")
     if level != "full":
         raise RigError(
-            f"rig {reference[:80]}: found level {level}, which the open hand alone has\n"
-            "leave out --level: other rigs are used as they are"
+            f"rig {reference[:80]}: found level {level}, which the open hand alone has",
+            "",
+            "leave out `level`: other rigs are used as they are",
         )
     path = Path(reference)
     if path.suffix == ".pkl":
@@ -172,8 +175,9 @@ def _named(reference: str) -> Path:
         )
     if not named:
         raise LicensedRigMissing(
-            f"rig {reference[:80]}: not imported; {rigs_folder()} does not hold it\n"
-            f"{WHERE_TO_GET_IT}"
+            f"rig {reference[:80]}: not imported; {rigs_folder()} does not hold it",
+            "",
+            f"{WHERE_TO_GET_IT}",
         )
     return named[0]
 
@@ -197,8 +201,9 @@ def find_rig(sha256: str, name: str) -> Rig:
             return read_rig(path)
     if name.startswith("mano"):
         raise LicensedRigMissing(
-            f"rig {name} ({sha256[:12]}): not imported; {rigs_folder()} does not hold it\n"
-            f"{WHERE_TO_GET_IT}"
+            f"rig {name} ({sha256[:12]}): not imported; {rigs_folder()} does not hold it",
+            "",
+            f"{WHERE_TO_GET_IT}",
         )
     raise RigError(
         f"rig {name} ({sha256[:12]}): unknown; the open hand of this version is "

@@ -16,6 +16,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from handavatar.errors import SEEDS, raise_if_refused, require_ranges
 from handavatar.geometry.closest import closest_on_mesh
 from handavatar.geometry.meshes import uniform_laplacian_matrix, unique_edges
 from handavatar.geometry.rotations import (
@@ -33,7 +34,7 @@ from handavatar.jobs.finite import require_finite
 
 SHARPNESS = 100.0
 """The paper's eta: a weight of 0.01 counts as 63 % of a bone."""
-_BEGIN_ANEW = "begin anew with another --seed or a lower --lr, and without --resume"
+_BEGIN_ANEW = "begin anew with another `seed` or a lower `lr`, and without `resume=True`"
 # Decay of the running means of the gradient and of its square.
 _MOMENTUM, _SCALE = 0.9, 0.99
 
@@ -77,6 +78,22 @@ class RefinementOptions:
     final_lr: float = 1e-5
     is_local: bool = True
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            steps=(0, 10**7),
+            refit_steps=(0, 10**7),
+            poses=(1, 1000),
+            surface_points=(1, 10**6),
+            smoothness=(0, 1e6),
+            surface=(0, 1e6),
+            sparsity=(0, 1e6),
+            lr=(1e-12, 1),
+            final_lr=(1e-12, 1),
+            seed=SEEDS,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +142,7 @@ class RefinementState:
             require_finite(tensors, "state")
             state = RefinementState(step=int(header["step"]), **tensors)
         except Exception as error:
+            raise_if_refused(error)
             raise RigError(
                 f"{path}: cannot be continued ({error}); delete it and begin anew"
             ) from error

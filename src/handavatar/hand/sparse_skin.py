@@ -9,6 +9,7 @@ from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from handavatar.errors import raise_if_refused
 from handavatar.hand.pose import NUM_BONES
 from handavatar.hand.rig import Rig, RigError
 from handavatar.jobs.files import write_atomically
@@ -102,6 +103,7 @@ class SparseSkin:
             )
             is_sound: Bool[Tensor, ""] = (skin.shares.sum(-1) == _WHOLE).all()
         except Exception as error:
+            raise_if_refused(error)
             raise RigError(
                 f"{path}: cannot be read as skin weights ({error}); make them again with "
                 "`handavatar rig refine`"

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from handavatar import __version__
+from handavatar.errors import ErrorKind, HandAvatarError
 
 MARKER = ".handavatar"
 """Name of the file that says that, and how, the program made a folder."""
@@ -42,19 +43,14 @@ _AT_WORKING_FOLDER, _EXCHANGE = -100, 2
 _log = logging.getLogger(__name__)
 
 
-class FolderInUse(ValueError):
-    """A place where a folder cannot be written.
+class FolderInUse(HandAvatarError):
+    """A place where a folder cannot be written: what lies there, and what to do about it."""
 
-    Attributes:
-        found: what lies there.
-        remedy: what to do about it.
-    """
+    kind = ErrorKind.USAGE
 
-    def __init__(self, found: str, remedy: str) -> None:
-        """Keeps the two halves apart, for those who have an error of their own."""
-        super().__init__(f"{found}\n{remedy}")
-        self.found = found
-        self.remedy = remedy
+    def __init__(self, found: str, remedy: str = "") -> None:
+        """Nothing else is expected than a place that is free."""
+        super().__init__(found, "", remedy)
 
 
 def _never(folder: Path) -> bool:
@@ -308,7 +304,7 @@ def refuse_file_in_use(path: Path, overwrite: bool = False) -> None:
     if not path.is_file():
         raise FolderInUse(f"{path} is no file, expected none or a file", "name another file")
     if not overwrite:
-        raise FolderInUse(f"{path} exists", "name another file, or use --overwrite")
+        raise FolderInUse(f"{path} exists", "name another file, or use `overwrite=True`")
 
 
 # --- replacing a folder ---------------------------------------------------------------------------
@@ -348,7 +344,7 @@ def refuse_folder_in_use(
     if is_empty(target):
         return
     if not overwrite:
-        raise FolderInUse(f"{target}: not empty", "name another folder, or use --overwrite")
+        raise FolderInUse(f"{target}: not empty", "name another folder, or use `overwrite=True`")
     marker = read_marker(target)
     if not kind.is_older(target) if marker is None else marker["kind"] != kind.name:
         raise FolderInUse(

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from handavatar.avatar import RenderSettings
 from handavatar.capture.frames import Frame, read_capture
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable, step_counter
 from handavatar.evaluate.textured_mesh import RAYS, fit_textured_mesh
@@ -59,6 +60,10 @@ class PeersTableOptions:
     steps: int = 310
     peer_steps: int = 600
     any_commit: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, seeds=SEEDS, steps=(1, 10**8), peer_steps=(1, 10**8))
 
     @property
     def total_steps(self) -> int:

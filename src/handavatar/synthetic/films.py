@@ -18,9 +18,9 @@ from safetensors.torch import save
 from scipy import ndimage
 from torch import Tensor
 
-from handavatar.capture.checks import CaptureError
 from handavatar.capture.motion import MOTIONS, Motion, gesture, placed
 from handavatar.capture.synthetic import SynthOptions, make_subject
+from handavatar.errors import require_ranges
 from handavatar.geometry.cameras import Camera, project
 from handavatar.geometry.colors import srgb_from_linear
 from handavatar.geometry.rotations import (
@@ -104,19 +104,14 @@ class FilmOptions:
 
     def __post_init__(self) -> None:
         """Refuses what cannot be made."""
-        limits = {
-            "width": (96, 1920),
-            "height": (96, 1920),
-            "seconds": (0.5, 60),
-            "fps": (1, 120),
-            "shutter": (0, 1),
-        }
-        for name, (least, most) in limits.items():
-            if not least <= getattr(self, name) <= most:
-                raise CaptureError(
-                    f"{name} is {getattr(self, name)}, expected {least} to {most}",
-                    "choose a value between",
-                )
+        require_ranges(
+            self,
+            width=(96, 1920),
+            height=(96, 1920),
+            seconds=(0.5, 60),
+            fps=(1, 120),
+            shutter=(0, 1),
+        )
 
     @property
     def num_frames(self) -> int:

@@ -15,6 +15,7 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from handavatar.capture.checks import CaptureError
+from handavatar.errors import SEEDS, raise_if_refused, require_ranges
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import refuse_file_in_use, write_atomically
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
@@ -78,6 +79,17 @@ class TrackerTrainOptions:
     overwrite: bool = False
     """replace a file at OUT, and what a training of it has left"""
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            count=(1, 10**8),
+            steps=(1, 10**8),
+            seed=SEEDS,
+            processes=(0, 1024),
+            rate=(1e-12, 1),
+        )
+
 
 @dataclass(frozen=True)
 class TrackerEvaluateOptions:
@@ -87,6 +99,10 @@ class TrackerEvaluateOptions:
     """file; the one that ships if None"""
     count: int = 2000
     """made pictures that none was taught with"""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, count=(1, 10**7))
 
 
 def train_made_tracker(options: TrackerTrainOptions, progress: Progress = SILENT) -> TrainedTracker:
@@ -109,7 +125,7 @@ def train_made_tracker(options: TrackerTrainOptions, progress: Progress = SILENT
         refuse_file_in_use(path, options.overwrite or options.resume)
     if options.resume and not state_file.is_file():
         raise CaptureError(
-            f"{state_file}: there is nothing to go on with", "train without --resume"
+            f"{state_file}: there is nothing to go on with", "train without `resume=True`"
         )
     rig = load_rig(RIG)
     points = TrackedPoints.of(rig, NUM_SKIN_POINTS)
@@ -130,8 +146,9 @@ def train_made_tracker(options: TrackerTrainOptions, progress: Progress = SILENT
             require_finite(state, "state")
             training.restore(state)
         except (OSError, SafetensorError, KeyError, RuntimeError, NotFinite) as error:
+            raise_if_refused(error)
             raise CaptureError(
-                f"{state_file} cannot be gone on with ({error})", "train without --resume"
+                f"{state_file} cannot be gone on with ({error})", "train without `resume=True`"
             ) from error
     lessons = draw_lessons(read_pictures(files), training)
     saved, written = time.monotonic(), training.step
@@ -163,11 +180,11 @@ def train_made_tracker(options: TrackerTrainOptions, progress: Progress = SILENT
 def _way_from(options: TrackerTrainOptions, written: int) -> str:
     """What to do after a step that was not finite; the step of the state that was written."""
     again = "give the same command again with"
-    rate = f"--rate {options.rate / 2:g}"
+    rate = f"`rate={options.rate / 2:g}`"
     if not written:
         return f"{again} {rate}"
     state_file = options.out.with_suffix(".state")
-    return f"{state_file} holds step {written}, which is good\n{again} --resume {rate}"
+    return f"{state_file} holds step {written}, which is good\n{again} `resume=True` {rate}"
 
 
 def evaluate_made_tracker(options: TrackerEvaluateOptions) -> TrackerFigures:
@@ -243,5 +260,6 @@ def read_pictures(files: list[Path]) -> CropBatch:
         try:
             parts.append(load_file(file))
         except (OSError, SafetensorError) as error:
+            raise_if_refused(error)
             raise CaptureError(f"{file} cannot be read ({error})", "delete it") from error
     return CropBatch.joined(parts)

@@ -10,6 +10,7 @@ import torch
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.frames import read_capture
+from handavatar.errors import SEEDS, ArgumentError, require_ranges
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable, step_counter
 from handavatar.jobs.files import make_folder
@@ -50,6 +51,10 @@ class AblationTableOptions:
     steps: int = 310
     any_commit: bool = False
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, seeds=SEEDS, steps=(1, 10**8))
+
     @property
     def names(self) -> tuple[str, ...]:
         """Of the rows.
@@ -59,7 +64,7 @@ class AblationTableOptions:
         """
         for word in self.rows:
             if not any(word in name for name in ROWS):
-                raise ValueError(f"--rows {word}: no row is called so; there are {'; '.join(ROWS)}")
+                raise ArgumentError("rows", f"no row is called {word}; there are {'; '.join(ROWS)}")
         words = self.rows or ("",)
         return tuple(name for name in ROWS if any(word in name for word in words))
 

@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from handavatar.errors import SEEDS, ArgumentError, require_ranges
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
@@ -87,6 +88,20 @@ class ComparisonOptions:
     level: Level = "full"
     rounds: int = POINT_ROUNDS
     device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            guides=(0, 4),
+            seeds=SEEDS,
+            steps=(1, 10**8),
+            points=(1, 10**6),
+            poses=(2, 10**5),
+            judged_points=(2, 10**6),
+            measured_poses=(2, 10**5),
+            rounds=(0, 4),
+        )
 
 
 GUIDED: Decoder = "coap"
@@ -278,23 +293,24 @@ def _interval(interval: Mapping[str, float], scale: float = 1.0) -> str:
 
 def _check(options: ComparisonOptions) -> None:
     if "pair" not in options.decoders or len(set(options.decoders)) < 2:
-        raise ValueError(
-            f"comparison: found the decoders {options.decoders}, expected 'pair' and at least one "
-            f"other of {get_args(Decoder)}"
+        raise ArgumentError(
+            "decoders",
+            str(options.decoders),
+            f"'pair' and at least one other of {get_args(Decoder)}",
         )
     if any(rounds < 0 for rounds in options.guides) or len(set(options.guides)) < len(
         options.guides
     ):
-        raise ValueError(
-            f"comparison: found the guides {options.guides}, expected different numbers of "
-            "subdivisions, 0 or more"
+        raise ArgumentError(
+            "guides", str(options.guides), "different numbers of subdivisions, 0 or more"
         )
     if not options.seeds or len(set(options.seeds)) < len(options.seeds):
-        raise ValueError(f"comparison: found the seeds {options.seeds}, expected different ones")
+        raise ArgumentError("seeds", str(options.seeds), "different ones")
     if options.poses < 2 or not 2 <= options.measured_poses <= options.poses:
-        raise ValueError(
-            f"comparison: found {options.poses} poses of which {options.measured_poses} are "
-            "measured, expected two or more of both and no more measured than judged"
+        raise ArgumentError(
+            "measured_poses",
+            f"{options.measured_poses} of {options.poses} poses",
+            "two or more of both and no more measured than judged",
         )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
+from handavatar.errors import require_ranges
 from handavatar.evaluate.geometry import Skin, Truth
 from handavatar.evaluate.tables import ResultTable
 from handavatar.field.decoders import OccupancyField
@@ -35,6 +36,11 @@ class GeometryTableOptions(ComparisonOptions):
     """
 
     resolution: int = 128
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        super().__post_init__()
+        require_ranges(self, resolution=(2, 1024))
 
     @property
     def total_steps(self) -> int:

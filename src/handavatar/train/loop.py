@@ -19,6 +19,7 @@ from handavatar.capture.frames import FITTED_SIDE, Capture, CaptureError, Frame,
 from handavatar.capture.soundness import require_sound
 from handavatar.capture.view import view_of
 from handavatar.edit import Edit
+from handavatar.errors import SEEDS, argument, require_ranges
 from handavatar.evaluate.metrics import mean_color
 from handavatar.evaluate.perceptual import PerceptualChoice, PerceptualLoss, perceptual_loss
 from handavatar.field.shading import CueSet, OrientedCues, PaperCues, TracedCues
@@ -267,6 +268,10 @@ class TrainOptions:
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, steps=(1, 10**8), checkpoint_every=(1, 10**8), seed=SEEDS)
+
 
 @dataclass(frozen=True, eq=False)
 class Training:
@@ -311,8 +316,6 @@ def _train(options: TrainOptions, progress: Progress) -> Path:
     device = chosen_device(options.device)
     method = METHODS[options.method]
     steps = method.steps if options.steps is None else options.steps
-    if steps < 1:
-        raise ValueError(f"--steps {steps}: expected at least 1")
     capture = read_capture(options.capture)
     stages = progress.stages(
         stage_seconds(method, steps, len(capture.split("train")), capture.is_tracked)
@@ -328,7 +331,7 @@ def _train(options: TrainOptions, progress: Progress) -> Path:
     run = _open_or_create(options, capture, perceptual.name, steps)
     live = shown_live(run, training.avatar, training.corrections, frames, progress)
     begun = run.facts["seed"]
-    words = f"--out {run.folder} --resume auto"
+    words = f"{argument('out', run.folder)} `resume='auto'`"
     noted = divergence_noted(run, begun, options.seed, words)
     where = "before the first step"
     with locked(run), live as progress, _repeatable(device), noted:
@@ -1102,8 +1105,9 @@ def _require_same_training(run: Run, options: TrainOptions, capture: Capture) ->
     """A run goes on with what it was begun with, or not at all."""
     if run.options.get("avatar_schema") != SCHEMA:
         raise CheckpointError(
-            f"{run.folder}: was begun by a version whose weights mean something else\n"
-            "name another folder with --out, or begin anew with --resume never"
+            f"{run.folder}: was begun by a version whose weights mean something else",
+            "",
+            "name another folder with `out`, or begin anew with `resume='never'`",
         )
     facts = run.facts
     seed = read_seeds(run, facts["seed"])[-1].seed
@@ -1114,8 +1118,9 @@ def _require_same_training(run: Run, options: TrainOptions, capture: Capture) ->
     for what, old, new in zip(("capture", "seed", "method"), then, now, strict=True):
         if old != new:
             raise CheckpointError(
-                f"{run.folder}: was begun with {what} {str(old)[:12]}, now it is {str(new)[:12]}\n"
-                "name another folder with --out, or begin anew with --resume never"
+                f"{run.folder}: was begun with {what} {str(old)[:12]}, now it is {str(new)[:12]}",
+                "",
+                "name another folder with `out`, or begin anew with `resume='never'`",
             )
 
 

@@ -265,14 +265,16 @@ def begin_prior_run(folder: Path, options: Json) -> Run:
             different = others if may_take_seed(run, old, new) else sorted({*others, "seed"})
         if different:
             raise CheckpointError(
-                f"{folder}: the run there was begun with other options: {', '.join(different)}\n"
-                "give the same ones to continue it, or name another folder with --folder"
+                f"{folder}: the run there was begun with other options: {', '.join(different)}",
+                "",
+                "give the same ones to continue it, or name another folder with `folder`",
             )
         return run
     if not is_empty(folder) and not is_unfinished_start(folder):
         raise CheckpointError(
-            f"{folder}: holds something that is no pre-training run, expected a new folder\n"
-            "name another with --folder"
+            f"{folder}: holds something that is no pre-training run, expected a new folder",
+            "",
+            "name another with `folder`",
         )
     make_folder(folder, RUN)
     run.checkpoints.mkdir(exist_ok=True)

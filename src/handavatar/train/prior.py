@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from handavatar.avatar import CheckpointError
+from handavatar.errors import SEEDS, ArgumentError, argument, raise_if_refused, require_ranges
 from handavatar.evaluate.metrics import mask_iou
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
 from handavatar.hand.open_hand import Level
@@ -117,6 +118,21 @@ class PriorOptions:
     device: str = "cpu"
     overwrite: bool = False
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            steps=(1, 10**8),
+            poses=(1, 1000),
+            points=(1, 10**6),
+            joint_points=(0, 10**6),
+            lr=(1e-12, 1),
+            final_lr=(1e-12, 1),
+            rounds=(0, 4),
+            seed=SEEDS,
+            checkpoint_every=(1, 10**8),
+        )
+
 
 def train_prior(options: PriorOptions, progress: Progress = SILENT) -> OccupancyField:
     """Pre-trains the occupancy field and writes it.
@@ -141,25 +157,27 @@ def train_prior(options: PriorOptions, progress: Progress = SILENT) -> Occupancy
             joints with another decoder.
     """
     if options.joint_points and options.decoder != "pair":
-        raise ValueError(
-            f"prior: found {options.joint_points} points at joints for the decoder "
-            f"{options.decoder!r}; only 'pair' answers for two parts at once"
+        raise ArgumentError(
+            "joint_points",
+            f"{options.joint_points} for the decoder {options.decoder!r}",
+            "0: only 'pair' answers for two parts at once",
         )
     is_begun = options.folder is not None and not is_empty(options.folder)
     refuse_file_in_use(options.out, options.overwrite or is_begun)
     base = load_rig(options.rig, options.level)
     with joined_processes(options.device) as processes, heard_signals():
         if options.poses % processes.count:
-            raise ValueError(
-                f"prior: found {options.poses} poses a step for {processes.count} processes, "
-                "expected as many for each; give a multiple with --poses"
+            raise ArgumentError(
+                "poses",
+                f"{options.poses} a step for {processes.count} processes",
+                "as many for each: a multiple",
             )
         with ExitStack() as held:
             run = None
             if options.folder is not None and processes.is_first:
                 run = begin_prior_run(options.folder, _what_to_learn(options, base))
                 held.enter_context(locked(run))
-                begun, words = run.options["seed"], f"--folder {options.folder}"
+                begun, words = run.options["seed"], argument("folder", options.folder)
                 held.enter_context(divergence_noted(run, begun, options.seed, words))
             return _trained(options, base, processes, run, progress)
 
@@ -262,10 +280,10 @@ def _way_from(options: PriorOptions, written: int) -> str:
     """What to do where there is no folder to go on in; the step of the file that was written."""
     again = "give the same command again with"
     if not written:
-        return f"{again} --seed {options.seed + 1}"
+        return f"{again} `seed={options.seed + 1}`"
     return (
         f"{options.out} holds the weights of step {written}, which are good\n"
-        f"{again} --start-from {options.out} --seed {options.seed + 1}"
+        f"{again} {argument('start_from', options.out)} `seed={options.seed + 1}`"
     )
 
 
@@ -319,17 +337,19 @@ def load_prior(
     if found != decoder:
         raise CheckpointError(
             f"{path} holds a prior with the decoder {found!r}, expected {decoder!r}: train one "
-            f"with `handavatar prior train --decoder {decoder}`"
+            f"with handavatar prior train {argument('decoder', decoder)}"
         )
     try:
         tensors = load_file(path)
         field.load_state_dict(tensors)
     except Exception as error:
+        raise_if_refused(error)
         raise CheckpointError(f"{path} is not a usable occupancy prior: {error}") from error
     if bad := find_not_finite(tensors):
         raise CheckpointError(
-            f"{path} is not a usable occupancy prior: {bad}\n"
-            "copy the file again, or leave it out: the prior that ships is good"
+            f"{path} is not a usable occupancy prior: {bad}",
+            "",
+            "copy the file again, or leave it out: the prior that ships is good",
         )
 
 
@@ -349,12 +369,14 @@ def _decoder_of(path: Path) -> Decoder:
     """Which decoder a file's weights are of; the first files did not say and hold PairOF."""
     if not path.is_file():
         raise CheckpointError(
-            f"no occupancy prior at {path}: train one with `handavatar prior train --out {path}`"
+            f"no occupancy prior at {path}: train one with handavatar prior train "
+            f"{argument('out', path)}"
         )
     try:
         with safe_open(path, framework="pt") as file:
             found = (file.metadata() or {}).get("decoder", "pair")
     except Exception as error:
+        raise_if_refused(error)
         raise CheckpointError(f"{path} is not a usable occupancy prior: {error}") from error
     for decoder in get_args(Decoder):
         if decoder == found:
@@ -384,6 +406,10 @@ class PriorEvaluationOptions:
     rig: str = "open-hand"
     level: Level = "full"
     rounds: int = POINT_ROUNDS
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, poses=(1, 10**5), points=(2, 10**6), rounds=(0, 4))
 
 
 def evaluate_prior(options: PriorEvaluationOptions) -> dict[str, float]:

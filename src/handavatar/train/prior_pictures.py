@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 from torch import Tensor
 
+from handavatar.errors import HandAvatarError, require_ranges
 from handavatar.evaluate.geometry import Skin, Truth
 from handavatar.field.decoders import OccupancyField
 from handavatar.geometry.cameras import framing_camera
@@ -73,6 +74,10 @@ class PriorPictureOptions:
     rounds: int = POINT_ROUNDS
     truth: bool = True
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, resolution=(2, 1024), size=(16, 4096), rounds=(0, 4))
+
 
 def picture_priors(options: PriorPictureOptions) -> list[Path]:
     """Writes a picture of each of ``POSES``.
@@ -105,6 +110,12 @@ def picture_priors(options: PriorPictureOptions) -> list[Path]:
         meshes = {}
         for name, field_of in fields.items():
             surface = extract_hand(field_of(hand), boxes, hand, options.resolution)
+            if len(surface.faces) == 0:
+                raise HandAvatarError(
+                    f"{name}: no surface is found at `resolution={options.resolution}`",
+                    "",
+                    "raise it; or is this no prior of this rig?",
+                )
             meshes[name] = (surface.vertices, surface.faces)
         path = options.out / f"{pose}.png"
         with write_aside(path) as aside:

@@ -15,16 +15,14 @@ can execute what it reads.
 """
 
 import errno
-import fcntl
 import json
 import logging
 import os
 import re
 import shutil
-import socket
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from hashlib import sha256
@@ -36,6 +34,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from handavatar.avatar import CheckpointError
+from handavatar.errors import raise_if_refused
 from handavatar.jobs.files import (
     MARKER,
     FolderKind,
@@ -46,11 +45,14 @@ from handavatar.jobs.files import (
     write_atomically,
 )
 from handavatar.jobs.finite import find_not_finite, require_finite
+from handavatar.jobs.locks import LockHeld, hold_lock
 from handavatar.train.provenance import package_versions, source_commit
 
 Json = dict[str, Any]
 
 _SCHEMA = 1
+LOCK = ".lock"
+"""Its name in the run's folder."""
 _KEPT_CHECKPOINTS = 3
 _MANIFEST = "MANIFEST.json"
 _STATE = "state.json"
@@ -142,8 +144,9 @@ class CheckpointContents:
 
 
 def default_run_folder(capture: Path, method: str, outputs: Path = Path("outputs")) -> Path:
-    """``outputs/{capture}/{method}/{time}``, local time to the second."""
-    return outputs / capture.resolve().name / method / datetime.now().strftime("%Y-%m-%d_%H%M%S")
+    """``outputs/{capture}/{method}/{time}``, local time to the second; always in UTF-8."""
+    name = capture.resolve().name.encode("utf-8", "replace").decode().replace("?", "_")
+    return outputs / name / method / datetime.now().strftime("%Y-%m-%d_%H%M%S")
 
 
 def interrupted_run_folder(
@@ -212,8 +215,9 @@ def create_run(
     }
     if not is_empty(folder) and not is_unfinished_start(folder):
         raise CheckpointError(
-            f"{folder}: not empty, expected a new folder\n"
-            "name another with --out, or continue the run that is there with --resume auto"
+            f"{folder}: not empty, expected a new folder",
+            "",
+            "name another with `out`, or continue the run that is there with `resume='auto'`",
         )
     run = Run(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -248,8 +252,9 @@ def open_run(folder: Path) -> Run:
     """
     if not (folder / "run.json").is_file():
         raise CheckpointError(
-            f"{folder}: no run.json in it, so it is not a run folder\n"
-            "give the folder that handavatar train printed, under outputs/"
+            f"{folder}: no run.json in it, so it is not a run folder",
+            "",
+            "give the folder that handavatar train printed, under outputs/",
         )
     return Run(folder)
 
@@ -261,19 +266,15 @@ def locked(run: Run) -> Iterator[None]:
     Raises:
         CheckpointError: if another process holds it.
     """
-    with open(run.folder / ".lock", "a+", encoding="utf-8") as file:
+    with ExitStack() as held:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.seek(0)
-            holder = file.read(200).strip() or "another process"
+            held.enter_context(hold_lock(run.folder / LOCK))
+        except LockHeld as error:
             raise CheckpointError(
-                f"{run.folder}: {holder} is writing this run\n"
-                "wait until it has ended or stop it, or train into another folder with --out"
+                f"{run.folder}: {error.found} is writing this run",
+                "",
+                "wait until it has ended or stop it, or train into another folder with `out`",
             ) from error
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}")
-        file.flush()
         yield
 
 
@@ -409,6 +410,7 @@ def load_checkpoint(checkpoint: Checkpoint) -> CheckpointContents:
             else:
                 tensors[path.stem] = safetensors.torch.load(data)
         except (ValueError, RecursionError, SafetensorError) as error:
+            raise_if_refused(error)
             raise _broken(path, f"cannot be read ({error})") from error
     if found := find_not_finite({**tensors, "state": state}):
         raise _broken(checkpoint.folder, f"cannot be gone on from: {found}")
@@ -434,8 +436,9 @@ def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
         raise _broken(path, "is not a manifest (cut or overwritten)") from error
     if schema > _SCHEMA:
         raise CheckpointError(
-            f"{path}: written by a newer version (schema {schema}, this one knows {_SCHEMA})\n"
-            "update handavatar, or train again with this version"
+            f"{path}: written by a newer version (schema {schema}, this one knows {_SCHEMA})",
+            "",
+            "update handavatar, or train again with this version",
         )
     if step != checkpoint.step or _STATE not in files:
         raise _broken(path, f"does not belong to step {checkpoint.step}")
@@ -448,6 +451,7 @@ def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
             found = member.stat().st_size
             data = member.read_bytes() if found == size else b""
         except OSError as error:
+            raise_if_refused(error)
             raise _broken(member, f"cannot be read ({error.strerror})") from error
         if found != size:
             raise _broken(member, f"has {found} bytes, the manifest says {size}")
@@ -459,8 +463,9 @@ def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
 
 def _broken(path: Path, what: str) -> CheckpointError:
     return CheckpointError(
-        f"{path}: {what}\n"
-        "continue from the newest whole checkpoint with --resume auto, or train again"
+        f"{path}: {what}",
+        "",
+        "continue from the newest whole checkpoint with `resume='auto'`, or train again",
     )
 
 

@@ -14,6 +14,7 @@ from importlib import resources
 from typing import Any, Protocol
 from urllib.parse import parse_qs, urlsplit
 
+from handavatar.errors import ArgumentError, HandAvatarError, machine_error
 from handavatar.view.guard import POSTED_KINDS, Guard, Refused
 from handavatar.view.limits import Connections, Limits
 from handavatar.view.scene import SceneError
@@ -186,8 +187,10 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
             return
         except Exception as error:  # one answer fails, the server goes on
-            print(f"view: {type(error).__name__}: {str(error)[:200]}", file=sys.stderr)
-            answer = self._failure(500, f"{type(error).__name__}: {str(error)[:200]}")
+            known = error if isinstance(error, HandAvatarError) else machine_error(error)
+            said = str(known)[:400] if known else f"{type(error).__name__}: {str(error)[:200]}"
+            print(f"view: {said}", file=sys.stderr)
+            answer = self._failure(500, said)
         self._send(answer)
 
     def _got(self) -> Answer:
@@ -262,7 +265,7 @@ def bound(host: str, port: int) -> HttpServer:
         port: the first to try; 0 is any.
 
     Raises:
-        OSError: if no port is free, or there is no such host.
+        ArgumentError: if no port is free, or there is no such host.
     """
     kind = _HttpServer6 if ":" in host else HttpServer
     last = min(port + MOST_PORTS, 65536) - 1 if port else 0
@@ -271,6 +274,9 @@ def bound(host: str, port: int) -> HttpServer:
             return kind((host, candidate))
         except OSError as error:
             if error.errno != errno.EADDRINUSE or candidate == last:
-                where = f"--host {host} --port {candidate}"
-                raise OSError(error.errno, f"{error.strerror}: choose another", where) from error
+                is_port = error.errno in (errno.EADDRINUSE, errno.EACCES)
+                found = f"{candidate if is_port else host}: {error.strerror}"
+                raise ArgumentError(
+                    "port" if is_port else "host", found, "", "choose another"
+                ) from error
     raise AssertionError("the last port returns or raises")

@@ -20,6 +20,7 @@ import torch
 
 from handavatar.avatar import HandAvatar, RenderSettings, chosen_device
 from handavatar.capture.motion import MOTIONS, Motion, read_motion
+from handavatar.errors import require_range, require_ranges
 from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.jobs.signals import awaited_signals
 from handavatar.jobs.threads import step_back
@@ -70,6 +71,10 @@ class ViewOptions:
     out: Path = Path("edited")
     device: str = "auto"
     kernel: Kernel = "auto"
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, port=(0, 65_535))
 
 
 class PageServer:
@@ -221,8 +226,7 @@ def checked_guard(host: str, port: int, token: str) -> Guard:
     Raises:
         ValueError: for a port or token that cannot be.
     """
-    if not 0 <= port < 65536:
-        raise ValueError(f"--port {port}: expected 0 to 65535")
+    require_range("port", port, 0, 65535)
     return guard_of(host, token)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from handavatar.avatar import HandAvatar
+from handavatar.errors import require_ranges
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.signals import awaited_signals
 from handavatar.tracker.model import shipped_tracker
@@ -51,6 +52,10 @@ class WebcamOptions:
     port: int = 7007
     host: str = "127.0.0.1"
     token: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, focal_share=(0.05, 50), longest=(0.1, 1e6), port=(0, 65_535))
 
 
 class WebcamServer(PageServer):
