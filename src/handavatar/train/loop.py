@@ -680,7 +680,7 @@ def _fit_or_restore_outlines(
 
 
 def _set_part_points(training: Training, parts: Mapping[str, Tensor]) -> None:
-    points = SurfacePoints(parts["corners"], parts["barycentric"])
+    points = SurfacePoints(parts["corners"].clone(), parts["barycentric"].clone())
     divided = training.avatar.parts.with_points(points)
     training.avatar.parts = divided.to(training.avatar.device)
 
