@@ -323,7 +323,9 @@ def _train(options: TrainOptions, progress: Progress) -> Path:
     require_sound(capture, stages["checks"])
     frames = training_frames(capture, method, stages["frames"])
     perceptual = perceptual_loss(options.perceptual).to(device)
+    stop_point()
     training = begin_training(capture, frames, method, options)
+    stop_point()
     views = [view_of(own) for own in frames_of_clips(capture, frames)]
     training.avatar.info["view"] = views[0]
     if len(views) > 1:
