@@ -901,7 +901,7 @@ class HandAvatar(nn.Module):
             grown = torch.nn.functional.max_pool2d(grown, window, stride=1, padding=padding)
         return grown[0, 0] > 0
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Writes one safetensors file, aside first, then renamed into place.
 
         Of a licensed rig it holds only name and fingerprint.
@@ -941,6 +941,7 @@ class HandAvatar(nn.Module):
         }
         if self.edit.light is not None:
             about["edit"]["light"] = self.edit.light
+        path = Path(path)
         require_finite({**tensors, **about}, f"{path}: not saved")
         stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
         write_atomically({path: save(stored, {"handavatar": json.dumps(about)})})

@@ -186,7 +186,8 @@ def _read_state(path: Path, expected: Json) -> WorkState | None:
     try:
         with safe_open(path, "pt") as file:
             record = json.loads(file.metadata()["state"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            # Cloned: products of matrices are rounded otherwise where memory begins elsewhere.
+            tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
         if {key: record[key] for key in expected} != expected:
             _log.warning("%s: is of other work, which is begun anew", path)
             return None

@@ -330,7 +330,9 @@ def _train(options: TrainOptions, progress: Progress) -> Path:
     require_sound(capture, stages["checks"])
     frames = training_frames(capture, method, stages["frames"])
     perceptual = perceptual_loss(options.perceptual).to(device)
+    stop_point()
     training = begin_training(capture, frames, method, options)
+    stop_point()
     views = [view_of(own) for own in frames_of_clips(capture, frames)]
     training.avatar.info["view"] = views[0]
     if len(views) > 1:
@@ -360,7 +362,10 @@ def _train(options: TrainOptions, progress: Progress) -> Path:
                     *(training, frames, method, checkpoint, options.seed, stages["samples"]),
                     StageStates(run.folder / _SAMPLES_STATE, work, ("samples", "light", "done")),
                 )
+            lights = _light_directions(training).clone()
             start = done = _restore(run, checkpoint, training)
+            # The checkpoint before the first step does not know them yet.
+            _light_directions(training).copy_(lights)
             edges = EdgeSet.of(training.avatar.rig)
             num_warm = min(method.warm_steps, steps)
             warm, joint = stages["train"].split(num_warm, steps, _JOINT_STEP / _WARM_STEP)
@@ -704,7 +709,7 @@ def _fit_or_restore_outlines(
 
 
 def _set_part_points(training: Training, parts: Mapping[str, Tensor]) -> None:
-    points = SurfacePoints(parts["corners"], parts["barycentric"])
+    points = SurfacePoints(parts["corners"].clone(), parts["barycentric"].clone())
     divided = training.avatar.parts.with_points(points)
     training.avatar.parts = divided.to(training.avatar.device)
 
@@ -824,6 +829,12 @@ def _outline_modules(training: Training) -> dict[str, torch.nn.Module]:
     return modules
 
 
+def _light_directions(training: Training) -> Tensor:
+    """Of the light that is traced; empty where none is."""
+    illumination = training.avatar.illumination
+    return illumination.directions if illumination.chosen.num_directions else torch.zeros(0)
+
+
 def _seen_samples(
     training: Training,
     frames: Sequence[Frame],
@@ -839,7 +850,7 @@ def _seen_samples(
     parts = progress.stages(seconds)
     avatar, corrected = training.avatar, corrected_frames(training, frames)
     settings = RenderSettings(num_samples=method.num_samples)
-    directions = avatar.illumination.directions if has_light else torch.zeros(0)
+    directions = _light_directions(training)
     if states.whole is not None and states.is_done("samples"):
         tensors = dict(states.whole.tensors)
         placed = tensors.pop("directions", directions)
