@@ -27,7 +27,7 @@ from handavatar.render.rasterize import interpolate, rasterize
 
 WIDTH, HEIGHT, FOCAL = 128, 144, 170.0
 FPS = 20.0
-NUM_PICTURES = 28
+NUM_PICTURES = 22
 FINER = 2
 """Pictures are drawn so many times as large, and averaged."""
 SKIN = (0.60, 0.34, 0.23)
@@ -37,7 +37,7 @@ DRIFT = 0.10
 """By which the logarithm of the exposure drifts, either way; red against blue by a third of it."""
 ARM = 0.16
 """Metres of forearm."""
-LEAVES = 0.11
+LEAVES = 0.115
 """Metres by which it moves aside at the end."""
 
 
@@ -103,7 +103,7 @@ def make_moving_hand() -> MovingHand:
         torch.tensor(FOCAL).log(),
         torch.zeros(21, 3),
     )
-    logs = DRIFT * np.stack([np.sin(5 * share + 0.5)] * 3, axis=-1)
+    logs = DRIFT * np.sin(5 * share.numpy()[:, None] + 0.5) * np.ones(3)
     logs += DRIFT / 3 * np.sin(4 * share.numpy()[:, None]) * np.array([1.0, 0.0, -1.0])
     gains = np.exp(logs - logs.mean(0))
     drawn = [
@@ -156,9 +156,7 @@ def _drawn(
     wall = np.array(WALLS)[(x + y) % 2]
     linear = np.where(covered[..., None], skin, wall)
     is_hand = covered & (fragments.face_index.numpy() < len(rig.faces))
-    layers = np.concatenate(
-        [linear, is_hand[..., None], (covered & ~is_hand)[..., None]], axis=-1
-    )
+    layers = np.concatenate([linear, is_hand[..., None], (covered & ~is_hand)[..., None]], axis=-1)
     small = layers.reshape(HEIGHT, FINER, WIDTH, FINER, 5).mean((1, 3))
     light = (small[..., :3] * gain).clip(0, 1)
     srgb = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)

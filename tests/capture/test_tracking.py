@@ -139,7 +139,9 @@ def test_a_left_hand_is_mirrored_to_a_right_one() -> None:
     assert np.allclose(hand.landmarks[:, 1], seen.landmarks[:, 1])
     assert np.allclose(hand.world_landmarks, seen.world_landmarks * (-1, 1, 1))
     # Overruled, the same pictures stay as they are.
-    assert np.allclose(track_hand(_frames(10), "right", finder=finder).hands[0].landmarks, seen.landmarks)
+    assert np.allclose(
+        track_hand(_frames(10), "right", finder=finder).hands[0].landmarks, seen.landmarks
+    )
 
 
 def test_mirroring_a_window_and_a_point_commute() -> None:

@@ -402,9 +402,7 @@ def _tracked_clip(
             "give the folder of the pictures that the cameras were found for; or a file without "
             "frames, if the camera stands still",
         )
-    found = (
-        _Tracked(track, {}, None) if track else _tracked(options, camera, progress, open_finder)
-    )
+    found = _Tracked(track, {}, None) if track else _tracked(options, camera, progress, open_finder)
     track, pinhole = found.track, found.pinhole
     if camera is not None and has_moved:
         track = _of_known_cameras(track, found.names, camera)
