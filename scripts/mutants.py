@@ -16,10 +16,10 @@ found nothing. Exits with the number of survivors that the list does not expect,
 import argparse
 import hashlib
 import json
+import multiprocessing
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -31,14 +31,30 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from queue import SimpleQueue
 
+import pytest
+
 ROOT = Path(__file__).resolve().parents[1]
 LIST = ROOT / "scripts/mutants.toml"
 PACKAGE = Path("src/handavatar")
 _COPIED = ("src", "tests", "docs", "examples", "scripts", "pyproject.toml", "README.md")
-_PYTEST = (
-    *("-x", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", "-rf", "--tb=no"),
-    "--jaxtyping-packages=handavatar,beartype.beartype",
+# Shapes are not checked, which takes as long again: what a test says of values has to do.
+_PYTEST = ("-x", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", "-rf", "--tb=no")
+_PRELOADED = (
+    *("numpy", "scipy.linalg", "scipy.ndimage", "scipy.sparse", "scipy.spatial", "scipy.special"),
+    *(
+        "scipy.stats",
+        "torch",
+        "torch._dynamo",
+        "safetensors.torch",
+        "PIL.Image",
+        "av",
+        "igl",
+        "cv2",
+    ),
+    *("jaxtyping", "pytest", "hypothesis", "rich", "tyro"),
 )
+"""What a process of tests need not import again: it takes longer than most tests."""
+_SERVER = multiprocessing.get_context("forkserver")
 _PATIENCE = 600.0
 """Seconds: a mutant that makes a test run for ever is found by that."""
 
@@ -121,24 +137,43 @@ def copy_tree(folder: Path) -> Path:
     return folder
 
 
-def run_tests(tree: Path, tests: Sequence[str]) -> subprocess.CompletedProcess[str]:
-    """Runs tests of a tree against its own package."""
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(tree / "src"),
-        "OMP_NUM_THREADS": "1",
-        "OMP_WAIT_POLICY": "PASSIVE",
-    }
-    files = [f"tests/{test}" for test in tests]
-    return subprocess.run(
-        [sys.executable, "-m", "pytest", *_PYTEST, *files],
-        cwd=tree,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=_PATIENCE,
-    )
+@dataclass(frozen=True)
+class TestRun:
+    """How tests ended.
+
+    Attributes:
+        code: pytest's exit status; None if they took too long.
+        output: of pytest.
+    """
+
+    code: int | None
+    output: str
+
+
+def run_tests(tree: Path, tests: Sequence[str]) -> TestRun:
+    """Runs tests of a tree against its own package, in a process that knows all other packages."""
+    with tempfile.NamedTemporaryFile() as output:
+        process = _SERVER.Process(target=_run_here, args=(tree, tuple(tests), output.name))
+        process.start()
+        process.join(_PATIENCE)
+        if process.is_alive():
+            process.kill()
+            process.join()
+            return TestRun(None, "")
+        return TestRun(process.exitcode, Path(output.name).read_text(errors="replace"))
+
+
+def _run_here(tree: Path, tests: tuple[str, ...], output: str) -> None:
+    written = os.open(output, os.O_WRONLY)
+    os.dup2(written, 1)
+    os.dup2(written, 2)
+    os.chdir(tree)
+    os.environ["PYTHONPATH"] = str(tree / "src")
+    sys.path.insert(0, str(tree / "src"))
+    code = pytest.main([*_PYTEST, *(f"tests/{test}" for test in tests)])
+    sys.stdout.flush()
+    # Without the end of the interpreter, for which threads of other packages may wait.
+    os._exit(int(code))
 
 
 def judge(mutant: Mutant, tree: Path) -> Verdict:
@@ -151,13 +186,13 @@ def judge(mutant: Mutant, tree: Path) -> Verdict:
         path.write_text(mutant.applied(sound), encoding="utf-8")
         _forget_compiled(path)
         done = run_tests(tree, mutant.tests)
-        found = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
-        by = found[1] if found else ""
-        state = {0: "survived", 1: "killed"}.get(done.returncode, "broken")
-        if state == "broken":
-            by = (done.stdout + done.stderr).strip().splitlines()[-1][:200]
-    except subprocess.TimeoutExpired:
-        state, by = "killed", f"{_PATIENCE:.0f} seconds"
+        found = re.search(r"^(?:FAILED|ERROR) (\S+)", done.output, re.MULTILINE)
+        if done.code is None:
+            state, by = "killed", f"{_PATIENCE:.0f} seconds"
+        elif found or done.code == 0:
+            state, by = ("killed", found[1]) if found else ("survived", "")
+        else:
+            by = (done.output.strip().splitlines() or [f"exit status {done.code}"])[-1][:200]
     finally:
         path.write_text(sound, encoding="utf-8")
         _forget_compiled(path)
@@ -191,6 +226,8 @@ def _asked() -> argparse.Namespace:
 def main() -> int:
     """Runs what is asked for; returns the number of mutants that are not as expected."""
     asked = _asked()
+    os.environ |= {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
+    _SERVER.set_forkserver_preload([*_PRELOADED])
     mutants = [
         mutant
         for mutant in read_mutants()
@@ -237,8 +274,8 @@ def _check_killers(tests: set[str], tree: Path) -> None:
     if not names:
         return
     done = run_tests(tree, names)
-    if done.returncode != 0:
-        sys.exit(f"tests fail on the package as it is:\n{done.stdout[-3000:]}{done.stderr[-1000:]}")
+    if done.code != 0:
+        sys.exit(f"tests fail on the package as it is:\n{done.output[-3000:]}")
     print(f"{len(names)} tests that killed pass on the package as it is", flush=True)
 
 
