@@ -38,7 +38,7 @@ LIST = ROOT / "scripts/mutants.toml"
 PACKAGE = Path("src/handavatar")
 _COPIED = ("src", "tests", "docs", "examples", "scripts", "pyproject.toml", "README.md")
 # Shapes are not checked, which takes as long again: what a test says of values has to do.
-_PYTEST = ("-x", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", "-rf", "--tb=no")
+_PYTEST = ("-x", "-q", "-p", "no:xdist", "-p", "no:cacheprovider", "-rfE", "--tb=no")
 _PRELOADED = (
     *("numpy", "scipy.linalg", "scipy.ndimage", "scipy.sparse", "scipy.spatial", "scipy.special"),
     *(
@@ -189,9 +189,11 @@ def judge(mutant: Mutant, tree: Path) -> Verdict:
         found = re.search(r"^(?:FAILED|ERROR) (\S+)", done.output, re.MULTILINE)
         if done.code is None:
             state, by = "killed", f"{_PATIENCE:.0f} seconds"
-        elif found or done.code == 0:
-            state, by = ("killed", found[1]) if found else ("survived", "")
-        else:
+        elif done.code == 0:
+            state = "survived"
+        elif done.code == 1 and found:
+            state, by = "killed", found[1]
+        else:  # Such as a module that can no longer be imported.
             by = (done.output.strip().splitlines() or [f"exit status {done.code}"])[-1][:200]
     finally:
         path.write_text(sound, encoding="utf-8")
@@ -239,6 +241,7 @@ def main() -> int:
         for mutant in mutants
         if asked.all
         or mutant.name not in kept
+        or kept[mutant.name].state == "broken"
         or kept[mutant.name].fingerprint != mutant.fingerprint()
     ]
     print(f"{len(mutants)} mutants, {len(waiting)} to run", flush=True)

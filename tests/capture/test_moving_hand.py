@@ -163,6 +163,8 @@ def test_the_side_is_that_of_the_hand_unless_it_is_named(
             truth[:, 0], world[:, 0], picture = WIDTH - truth[:, 0], -world[:, 0], picture[:, ::-1]
         assert np.allclose(hand.landmarks, truth)
         assert np.allclose(hand.world_landmarks, world)
+        glance = next(each for each in track.glances if each.index == hand.index)
+        assert np.abs(glance.image.astype(float) - picture).mean() < 3
         # The window shows the picture about the hand, where its corner says.
         window, middle = hand.window, truth.mean(0)
         x, y = np.floor(middle).astype(int)

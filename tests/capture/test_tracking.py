@@ -18,6 +18,7 @@ from handavatar.capture.tracking import (
     MediaPipeDetector,
     Sighting,
     UnusableTrackError,
+    find_other_hand,
     track_hand,
 )
 from handavatar.capture.windows import resampled, window_around
@@ -142,6 +143,15 @@ def test_a_left_hand_is_mirrored_to_a_right_one() -> None:
     assert np.allclose(
         track_hand(_frames(10), "right", finder=finder).hands[0].landmarks, seen.landmarks
     )
+
+
+def test_unsure_votes_say_nothing_of_the_other_hand() -> None:
+    """A second of them neither; a second of clear ones does."""
+    times = [number / 10 for number in range(20)]
+    for against, is_other in ((-0.2, False), (-0.4, True)):
+        votes = np.array([0.9] * 10 + [against] * 10)
+        found = find_other_hand(votes, times)
+        assert found.tolist() == [False] * 10 + [is_other] * 10
 
 
 def test_mirroring_a_window_and_a_point_commute() -> None:
