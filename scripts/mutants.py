@@ -95,11 +95,11 @@ class Mutant:
             )
         return text.replace(self.old, self.new)
 
-    def fingerprint(self) -> str:
-        """Of all that its verdict is known to depend on."""
+    def fingerprint(self, tree: Path = ROOT) -> str:
+        """Of all in a tree that its verdict is known to depend on."""
         digest = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode())
         for path in (PACKAGE / self.file, *(Path("tests") / test for test in self.tests)):
-            digest.update((ROOT / path).read_bytes())
+            digest.update((tree / path).read_bytes())
         return digest.hexdigest()[:16]
 
 
@@ -180,6 +180,7 @@ def judge(mutant: Mutant, tree: Path) -> Verdict:
     """Puts a fault into a copied tree, runs its tests, and takes it out again."""
     path = tree / PACKAGE / mutant.file
     sound = path.read_text(encoding="utf-8")
+    fingerprint = mutant.fingerprint(tree)
     begun = time.monotonic()
     state, by = "broken", ""
     try:
@@ -198,7 +199,7 @@ def judge(mutant: Mutant, tree: Path) -> Verdict:
     finally:
         path.write_text(sound, encoding="utf-8")
         _forget_compiled(path)
-    return Verdict(state, by, round(time.monotonic() - begun, 1), mutant.fingerprint())
+    return Verdict(state, by, round(time.monotonic() - begun, 1), fingerprint)
 
 
 def _forget_compiled(path: Path) -> None:
