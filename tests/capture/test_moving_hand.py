@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+import torch
 from moving_hand import (
     FOCAL,
     FPS,
@@ -23,14 +24,18 @@ from moving_hand import (
     TruthfulFinder,
     make_moving_hand,
 )
+from PIL import Image
 from scipy import ndimage
 
+from handavatar.capture import video as video_module
 from handavatar.capture.fitting import LANDMARK_ERROR, FitOptions
 from handavatar.capture.frames import Capture, Frame
 from handavatar.capture.soundness import find_problems
 from handavatar.capture.video import VideoOptions, capture_video, track_video
+from handavatar.capture.video_cameras import KnownCamera, Lens
 from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.cameras import project
+from handavatar.geometry.rotations import apply_rigid, matrix_from_axis_angle, rigid_transform
 from handavatar.hand.pose_sampling import limit_excess
 
 MISSED, UNSEEN, MISTAKEN, UNSURE, TORN = 4, 8, 10, 12, 14
@@ -172,6 +177,33 @@ def test_the_side_is_that_of_the_hand_unless_it_is_named(
         seen = window.image[row - 2 : row + 3, column - 2 : column + 3].astype(float)
         shown = picture[y - 2 : y + 3, x - 2 : x + 3].astype(float)
         assert np.abs(seen.mean((0, 1)) - shown.mean((0, 1))).max() < 6
+
+
+def test_known_cameras_of_a_left_hand_are_mirrored_with_it(
+    film: MovingHand, tmp_path: Path
+) -> None:
+    """A place of the world is seen in the mirrored picture where its mirror image was."""
+    pytest.importorskip("cv2")
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    for number in range(8):
+        mirrored = np.ascontiguousarray(film.pictures[number][:, ::-1])
+        Image.fromarray(mirrored).save(folder / f"{number:03d}.png")
+    turns = matrix_from_axis_angle(0.3 * torch.randn(8, 3, generator=torch.manual_seed(0)))
+    views = rigid_transform(turns, torch.randn(8, 3, generator=torch.manual_seed(1)))
+    lens = Lens((WIDTH, HEIGHT), (FOCAL, FOCAL), (60.0, 70.0), (0.0, 0.0), (0.0, 0.0))
+    known = {f"{number:03d}.png": view for number, view in enumerate(views)}
+    options = VideoOptions(folder, tmp_path / "out", fps=30.0, camera=(tmp_path,))
+    finder = TruthfulFinder(film, is_mirrored=True)
+    clip = video_module._tracked_clip(
+        options, film.rig, KnownCamera(lens, "made", known), lambda *_: None, None, lambda: finder
+    )
+    assert clip.track.side == "left" and clip.camera_from_world is not None
+    assert clip.track.principal_point == (WIDTH - 60.0, 70.0)
+    places = torch.randn(8, 5, 3, generator=torch.manual_seed(2))
+    mirror = torch.tensor([-1.0, 1.0, 1.0])
+    seen = apply_rigid(clip.camera_from_world, places * mirror)
+    assert torch.allclose(seen, apply_rigid(views, places) * mirror, atol=1e-5)
 
 
 def _film_places(made: Made, frame: Frame) -> np.ndarray:

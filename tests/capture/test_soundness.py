@@ -32,6 +32,7 @@ _FEW = (
     "focal length a quarter off, all",
     "thumb first, all",
     "swapped frames",
+    "masks shifted a little, all",
 )
 _LEAST_CAUGHT = 78 / 80
 
