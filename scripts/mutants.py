@@ -55,6 +55,8 @@ _PRELOADED = (
 )
 """What a process of tests need not import again: it takes longer than most tests."""
 _SERVER = multiprocessing.get_context("forkserver")
+_FAILED = re.compile(r"^(?:FAILED|ERROR) ([^\s\[]+(?:\[.*?\](?= - |$))?)", re.MULTILINE)
+"""The name of a test in pytest's summary; what is in brackets may have blanks."""
 _PATIENCE = 600.0
 """Seconds: a mutant that makes a test run for ever is found by that."""
 
@@ -187,7 +189,7 @@ def judge(mutant: Mutant, tree: Path) -> Verdict:
         path.write_text(mutant.applied(sound), encoding="utf-8")
         _forget_compiled(path)
         done = run_tests(tree, mutant.tests)
-        found = re.search(r"^(?:FAILED|ERROR) (\S+)", done.output, re.MULTILINE)
+        found = _FAILED.search(done.output)
         if done.code is None:
             state, by = "killed", f"{_PATIENCE:.0f} seconds"
         elif done.code == 0:
