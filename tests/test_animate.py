@@ -309,8 +309,8 @@ def _contents(folder: Path) -> dict[str, bytes]:
         ({"passes": "rgb,depht"}, "depht"),
         ({"passes": ""}, "passes"),
         ({"albedo_shift": "0.1,0"}, "three numbers"),
-        ({"albedo_shift": "0.1,0,nan"}, "finite"),
-        ({"light_gain": -1.0}, "gain not below 0"),
+        ({"albedo_shift": "0.1,0,nan"}, "expected -1 to 1"),
+        ({"light_gain": -1.0}, "`light_gain`: found -1.0, expected 0 to 1000"),
         ({"lift_shadow": "pinky"}, "neither a finger nor a bone"),
         ({"size": 0}, "size"),
         ({"frames": 0}, "frames"),
@@ -320,9 +320,8 @@ def _contents(folder: Path) -> dict[str, bytes]:
 def test_bad_options_are_errors_before_any_work(
     avatar_file: Path, motion_file: Path, tmp_path: Path, change: dict[str, object], message: str
 ) -> None:
-    options = replace(_options(avatar_file, motion_file, tmp_path / "out"), **change)
     with pytest.raises(ValueError, match=message):
-        render_motion(options)
+        render_motion(replace(_options(avatar_file, motion_file, tmp_path / "out"), **change))
     assert not list(tmp_path.iterdir())
 
 
@@ -414,7 +413,7 @@ def test_a_motion_is_rendered_in_the_light_and_the_view_of_a_clip(
         settings = RenderSettings(num_samples=16)
         rendering = two_lights.render(pose, camera, look, settings)
         assert np.array_equal(found, pass_pictures(rendering)["rgb"])
-    with pytest.raises(ValueError, match=r"light 2: .* choose from 0, 1"):
+    with pytest.raises(ValueError, match=r"`light`: .* of number 2; choose from 0, 1"):
         render_motion(replace(plain, out=tmp_path / "third", light=2))
     assert not (tmp_path / "third").exists()
     # What an interrupted command left is not taken for another light's.

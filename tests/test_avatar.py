@@ -686,7 +686,7 @@ def test_a_light_that_there_is_not_is_refused_by_its_number(
     two_lights: HandAvatar, small_avatar: HandAvatar, tmp_path: Path
 ) -> None:
     for avatar, light, known in ((two_lights, 2, "0, 1"), (small_avatar, 1, "0")):
-        message = f"light {light}: this avatar has none of that number; choose from {known} "
+        message = f"`light`: this avatar has none of number {light}; choose from {known} "
         with pytest.raises(ValueError, match=message):
             avatar.light_of(Edit(light=light))
         with pytest.raises(ValueError, match=message):
@@ -694,7 +694,7 @@ def test_a_light_that_there_is_not_is_refused_by_its_number(
     edited = copy.copy(two_lights)
     edited.edit = Edit(light=7)
     edited.save(tmp_path / "seventh.safetensors")
-    with pytest.raises(CheckpointError, match="light 7"):
+    with pytest.raises(CheckpointError, match="number 7"):
         HandAvatar.load(tmp_path / "seventh.safetensors")
 
 

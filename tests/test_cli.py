@@ -2,6 +2,7 @@
 
 import errno
 import json
+import logging
 import subprocess
 import sys
 import time
@@ -9,12 +10,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import torch
 
 from handavatar import __version__, cli
 from handavatar.avatar import CheckpointError
 from handavatar.capture.checks import CaptureError
 from handavatar.cli.arguments import JSON, Extra, parse, parse_with
-from handavatar.hand.rig import RigError
+from handavatar.errors import ArgumentError
+from handavatar.hand.rig import LicensedRigMissing, RigError
+from handavatar.jobs.files import FolderInUse
+from handavatar.jobs.finite import NotFinite
+from handavatar.jobs.progress import Progress
 
 
 def test_help_lists_every_command_and_answers_quickly() -> None:
@@ -68,10 +74,6 @@ def test_wrong_usage_is_exit_2(
     assert captured.out == "" and expected in captured.err and "Traceback" not in captured.err
 
 
-class OutOfMemoryError(RuntimeError):
-    """Named as torch's."""
-
-
 @pytest.mark.parametrize(
     ("error", "code", "expected"),
     [
@@ -81,13 +83,18 @@ class OutOfMemoryError(RuntimeError):
         (FileNotFoundError(errno.ENOENT, "No such file or directory", "a.mp4"), 3, "a.mp4"),
         (OSError(errno.ENOSPC, "No space left on device", "/out"), 5, "make room"),
         (MemoryError(), 5, "memory"),
-        (OutOfMemoryError("CUDA out of memory"), 5, "memory"),
+        (torch.OutOfMemoryError("CUDA out of memory"), 5, "memory"),
         (FloatingPointError("loss is not finite at step 7"), 6, "step 7"),
         (KeyboardInterrupt(), 130, "interrupted"),
         (KeyboardInterrupt("stopped at step 7"), 130, "step 7"),
         (ModuleNotFoundError("No module named 'mediapipe'", name="mediapipe"), 2, "[video]"),
         (ModuleNotFoundError("No module named 'handavatar.x'", name="handavatar.x"), 1, "--debug"),
-        (ValueError("--device cuda: there is no GPU"), 2, "--device cuda"),
+        (ArgumentError("num_samples", "0", "1 to 9"), 2, "--num-samples: found 0, expected 1 to 9"),
+        (FolderInUse("d: not empty", "or use `overwrite=True`"), 2, "or use --overwrite"),
+        (LicensedRigMissing("mano-left"), 4, "mano-left"),
+        (NotFinite("step 7: w holds NaN", "give `seed=1`"), 6, "give --seed 1"),
+        (KeyboardInterrupt("continue with `resume='auto'`"), 130, "continue with --resume auto"),
+        (ValueError("--device cuda: there is no GPU"), 1, "--debug"),
         (ValueError("a slip of ours"), 1, "--debug"),
         (CaptureError("\n".join(f"line {i}" for i in range(50))), 3, "line 0"),
     ],
@@ -99,7 +106,7 @@ def test_errors_become_exit_codes_and_a_few_lines(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def fail(words: list[str]) -> int:
+    def fail(words: list[str], progress: Progress) -> int:
         """Fails."""
         raise error
 
@@ -111,6 +118,20 @@ def test_errors_become_exit_codes_and_a_few_lines(
     assert len(captured.err.splitlines()) <= 6
     assert cli.main(["train", "--debug"]) == code
     assert "Traceback" in capsys.readouterr().err
+
+
+def test_warnings_are_printed_once_with_flags_and_nothing_raw(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def warn(words: list[str], progress: Progress) -> int:
+        """Warns."""
+        logging.getLogger("handavatar.train.runs").warning("%s: use `overwrite=True`", "a\x1b[2J")
+        return 0
+
+    monkeypatch.setitem(cli.COMMANDS, "train", warn)
+    for _ in range(2):
+        assert cli.main(["train"]) == 0
+        assert capsys.readouterr().err == "handavatar: a\\x1b[2J: use --overwrite\n"
 
 
 def test_rig_info_prints_one_json_object(capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,8 +11,10 @@ EVERYTHING_BELOW = (
     "alignment animate evaluate train peers export view webcam demo doctor synthetic bench tracker"
 )
 MAY_IMPORT = {
-    name: set(allowed.split())
+    name: {"errors", *allowed.split()}
     for name, allowed in {
+        # What users can cause, and how it is said.
+        "errors": "",
         "geometry": "",
         # Files and folders of a long command; knows no hand.
         "jobs": "",
@@ -58,7 +60,7 @@ MAY_IMPORT = {
         "view": "geometry jobs hand capture field render edit avatar retouch animate train webcam "
         "tracker",
         # What words and pictures mean to an avatar.
-        "retouch": "hand capture edit avatar",
+        "retouch": "jobs hand capture edit avatar",
         "processes": "",
         # Motions to pictures: what a viewer may see, the rasteriser's neighbours, and the kernels'
         # names.

@@ -30,6 +30,10 @@ EXACTLY = {
     ),
     "hand.rigs": "SCHEMA find_rig load_mano load_rig read_rig rigs_folder save_rig",
     "hand.detail": "refined subdivided",
+    "errors": (
+        "ARGUMENT_MARK ArgumentError ErrorKind HandAvatarError OutOfSpace PlaceRefused SEEDS "
+        "argument machine_error raise_if_refused require_range require_ranges"
+    ),
     "edit": "Edit Paint bones_named",
     "avatar": (
         "CheckpointError EXACT HandAvatar HandState RayValues RenderSettings Rendering "
@@ -57,6 +61,8 @@ AT_LEAST = {
     "capture.view": "start_of",
     "capture.video": "VideoOptions capture_video",
     "capture.synthetic": "SynthOptions make_capture",
+    "jobs.progress": "Progress Progress.stages Progress.skip shown_progress",
+    "jobs.signals": "Interrupted heard_signals stop_point",
     "train.loop": "TrainOptions train",
     "train.prior": "PriorOptions train_prior PriorEvaluationOptions evaluate_prior open_prior",
     "hand.pose_sampling": (

@@ -23,12 +23,20 @@ from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chos
 from handavatar.capture.motion import gesture, open_motion
 from handavatar.capture.view import camera_holding, start_of
 from handavatar.edit import Edit
+from handavatar.errors import ArgumentError, require_ranges
 from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.colors import eight_bits
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
-from handavatar.jobs.files import FolderKind, UnfinishedFolder, files_named, refuse_folder_in_use
+from handavatar.jobs.files import (
+    FolderKind,
+    UnfinishedFolder,
+    files_named,
+    refuse_folder_in_use,
+    write_atomically,
+)
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.video_writer import VideoWriter
 from handavatar.processes import joined_processes
 from handavatar.retouch import Look
@@ -86,9 +94,20 @@ class RenderOptions(Look):
     device: str = "auto"
     kernel: Kernel = "auto"
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        super().__post_init__()
+        require_ranges(
+            self, size=(2, 8192), frames=(1, 10**5), num_samples=(1, 4096), check=(0, 10**6)
+        )
 
-def render_motion(options: RenderOptions) -> Path:
+
+def render_motion(options: RenderOptions, progress: Progress = SILENT) -> Path:
     """Renders a motion: one PNG per frame and pass, and one video per pass.
+
+    Args:
+        options: what to render.
+        progress: told the frames done.
 
     Returns:
         The folder.
@@ -98,24 +117,16 @@ def render_motion(options: RenderOptions) -> Path:
     Raises:
         CheckpointError: if the avatar cannot be read.
         CaptureError: if the motion cannot be read.
-        ValueError: for a pass or an edit that does not exist.
+        ArgumentError: for a pass or an edit that does not exist.
         FolderInUse: if ``out`` holds something that may not be replaced.
     """
-    for flag, value, least in (
-        ("--size", options.size, 2),
-        ("--frames", 1 if options.frames is None else options.frames, 1),
-        ("--num-samples", options.num_samples, 1),
-        ("--check", options.check, 0),
-    ):
-        if value < least:
-            raise ValueError(f"{flag} {value}: expected at least {least}")
     passes = tuple(word.strip() for word in options.passes.split(",") if word.strip())
     if not passes:
-        raise ValueError(f"--passes: none given; choose from {', '.join(PASSES)}")
+        raise ArgumentError("passes", f"none given; choose from {', '.join(PASSES)}")
     for name in passes:
         if name not in PASSES:
-            raise ValueError(
-                f"--passes: there is no pass '{name}'; choose from {', '.join(PASSES)}"
+            raise ArgumentError(
+                "passes", f"there is no pass '{name}'; choose from {', '.join(PASSES)}"
             )
     options.check_look()
     inputs = [options.run, *files_named(options.motion, options.paint)]
@@ -143,11 +154,16 @@ def render_motion(options: RenderOptions) -> Path:
             if processes.is_first:
                 folder.begin(options.overwrite)
             processes.wait()
+            frames, videos = progress.stages(
+                {"frames": 1.0 * len(poses), "videos": 0.03 * len(poses) * len(passes)}
+            ).values()
             for index in range(processes.rank, len(poses), processes.count):
                 files = [f"{name}/{index:06d}.png" for name in passes]
                 files += [f"errors/{index:06d}.json"] * (options.check > 0)
                 if folder.has(files):
+                    frames.skip(index + 1, len(poses))
                     continue
+                frames(index, len(poses))
                 pose, view = poses[index], views[index]
                 rendering = avatar.render(pose, view, edit, settings)
                 pictures = pass_pictures(rendering, avatar.info.get("side", "right"))
@@ -163,7 +179,7 @@ def render_motion(options: RenderOptions) -> Path:
             raise
         if processes.is_first:
             fps = motion.fps * len(poses) / len(motion)
-            _join_frames(folder.path, passes, len(poses), fps, options)
+            _join_frames(folder.path, passes, len(poses), fps, options, videos)
             folder.finish()
         processes.wait()
     return options.out
@@ -238,22 +254,26 @@ def _what_frames_depend_on(
 
 
 def _join_frames(
-    folder: Path, passes: tuple[str, ...], count: int, fps: float, options: RenderOptions
+    folder: Path,
+    passes: tuple[str, ...],
+    count: int,
+    fps: float,
+    options: RenderOptions,
+    progress: Progress,
 ) -> None:
     """Makes the videos, and one file of the frames' errors, from what all processes wrote."""
-    for name in passes:
-        writer = VideoWriter(folder / f"{name}.mp4", fps, options.size)
-        for index in range(count):
-            writer.add(np.asarray(Image.open(folder / name / f"{index:06d}.png")))
-        writer.close()
+    for number, name in enumerate(passes):
+        with VideoWriter(folder / f"{name}.mp4", fps, options.size) as writer:
+            for index in range(count):
+                writer.add(np.asarray(Image.open(folder / name / f"{index:06d}.png")))
+                progress(number * count + index + 1, len(passes) * count)
     if options.check:
         files = [folder / "errors" / f"{index:06d}.json" for index in range(count)]
         frames = [json.loads(path.read_text(encoding="utf-8")) for path in files]
         worst = max(frame["max_error"] for frame in frames)
         value = {"max_error": worst, "worst_psnr": min(frame["psnr"] for frame in frames)}
-        (folder / "errors.json").write_text(
-            json.dumps(value | {"frames": frames}, indent=2) + "\n", encoding="utf-8"
-        )
+        text = json.dumps(value | {"frames": frames}, indent=2) + "\n"
+        write_atomically({folder / "errors.json": text.encode()})
         for path in files:
             path.unlink()
         (folder / "errors").rmdir()

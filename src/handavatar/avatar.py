@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 from jaxtyping import Bool, Float, Int
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from handavatar.edit import Edit, Paint
+from handavatar.errors import ArgumentError, HandAvatarError, argument, raise_if_refused
 from handavatar.field.anchors import Neighbours, nearest_anchors, place_anchors
 from handavatar.field.kernels import SHORTER, Kernel, settled_kernel
 from handavatar.field.occupancy import HandCodes, PairItems, PairOccupancy, decided_items
@@ -41,6 +42,7 @@ from handavatar.hand.parts import finer_rig
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.rig import RIG_ARRAYS, PosedHand, Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
+from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import find_not_finite, require_finite
 from handavatar.jobs.threads import mapped
 from handavatar.render.chart import charted
@@ -117,25 +119,28 @@ def chosen_device(name: str) -> torch.device:
         name: ``auto``, ``cpu``, ``cuda``, or one of several GPUs such as ``cuda:1``.
 
     Raises:
-        ValueError: there is no such device, or it is of a kind that nothing here runs on.
+        ArgumentError: there is no such device, or it is of a kind that nothing here runs on.
     """
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if name == "auto":
         name = "cuda" if count else "cpu"
     found = re.fullmatch(r"cpu|cuda(?::(\d{1,3}))?", name)
     if found is None:
-        raise ValueError(
-            f"--device {name[:20]}: expected auto, cpu, cuda, or cuda:N for one of several GPUs "
-            "(NVIDIA's; on others use cpu)"
+        raise ArgumentError(
+            "device",
+            name[:20],
+            "auto, cpu, cuda, or cuda:N for one of several GPUs (NVIDIA's; on others use cpu)",
         )
     if name != "cpu" and not count:
-        raise ValueError(f"--device {name}: no CUDA device is visible to torch; use --device cpu")
+        raise ArgumentError(
+            "device", f"{name}, but no CUDA device is visible to torch", "", "use `device='cpu'`"
+        )
     if found[1] and int(found[1]) >= count:
-        raise ValueError(f"--device {name}: torch sees {count}, cuda:0 to cuda:{count - 1}")
+        raise ArgumentError("device", name, f"one of the {count} that torch sees, from cuda:0")
     return torch.device(name)
 
 
-class CheckpointError(ValueError):
+class CheckpointError(HandAvatarError):
     """A file of weights that cannot be used: which, what is wrong with it, what to do."""
 
 
@@ -366,15 +371,16 @@ class HandAvatar(nn.Module):
             edit: on top of the avatar's own.
 
         Raises:
-            ValueError: if the avatar has no light of that number.
+            ArgumentError: if the avatar has no light of that number.
         """
         chosen = None if edit is None else edit.light
         light = (self.edit.light if chosen is None else chosen) or 0
         if not 0 <= light < self.num_lights:
             known = ", ".join(map(str, range(self.num_lights)))
-            raise ValueError(
-                f"light {light}: this avatar has none of that number; choose from {known} "
-                "(one for each clip of its capture)"
+            raise ArgumentError(
+                "light",
+                f"this avatar has none of number {light}; choose from {known} (one for each clip "
+                "of its capture)",
             )
         return light
 
@@ -808,19 +814,13 @@ class HandAvatar(nn.Module):
             settings: samples and bounds.
 
         Raises:
-            ValueError: if there are not as many cameras, or edits, as poses.
+            ArgumentError: if there are not as many cameras, or edits, as poses.
         """
         if len(poses) != len(cameras):
-            raise ValueError(
-                f"render_batch: found {len(poses)} poses and {len(cameras)} cameras, expected as "
-                "many of both"
-            )
+            raise ArgumentError("cameras", str(len(cameras)), f"as many as poses, {len(poses)}")
         edits = [edit or Edit()] * len(poses) if edit is None or isinstance(edit, Edit) else edit
         if len(edits) != len(poses):
-            raise ValueError(
-                f"render_batch: found {len(poses)} poses and {len(edits)} edits, expected as many "
-                "of both"
-            )
+            raise ArgumentError("edit", str(len(edits)), f"as many as poses, {len(poses)}")
         settings = settings or RenderSettings()
         keys = [(id(pose), one.lifted_bones) for pose, one in zip(poses, edits, strict=True)]
         wanted = dict(zip(keys, zip(poses, edits, strict=True), strict=True))
@@ -942,11 +942,8 @@ class HandAvatar(nn.Module):
         if self.edit.light is not None:
             about["edit"]["light"] = self.edit.light
         require_finite({**tensors, **about}, f"{path}: not saved")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside = path.with_name(path.name + ".tmp")
         stored = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-        save_file(stored, aside, {"handavatar": json.dumps(about)})
-        aside.replace(path)
+        write_atomically({path: save(stored, {"handavatar": json.dumps(about)})})
 
     @staticmethod
     def load(path: Path | str) -> "HandAvatar":
@@ -1069,7 +1066,7 @@ def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         if not (path / "avatar.safetensors").is_file():
             raise CheckpointError(
                 f"{path}: holds no avatar.safetensors; finish its training with "
-                "`handavatar train ... --resume auto`"
+                "handavatar train CAPTURE `resume='auto'`"
             )
         path = path / "avatar.safetensors"
     if not path.is_file():
@@ -1084,6 +1081,7 @@ def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             about = json.loads((file.metadata() or {}).get("handavatar", "null"))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except Exception as error:
+        raise_if_refused(error)
         raise CheckpointError(
             f"{path}: cannot be read as safetensors ({error}); the file is damaged or not "
             "complete: copy it again or take it from the run's last checkpoint"
@@ -1094,9 +1092,10 @@ def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
         )
     if found := find_not_finite({**tensors, **about}):
         raise CheckpointError(
-            f"{path}: {found}, expected finite numbers\n"
+            f"{path}: {found}, expected finite numbers",
+            "",
             "copy the file again, or train again into its run, from the last checkpoint: "
-            f"handavatar train CAPTURE --out {path.parent} --resume auto"
+            f"handavatar train CAPTURE {argument('out', path.parent)} `resume='auto'`",
         )
     return about, tensors
 

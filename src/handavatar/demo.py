@@ -1,7 +1,6 @@
 """The embedded default: the whole road on the capture that ships, offline, on two cores."""
 
 import json
-import shutil
 import sys
 import time
 from dataclasses import dataclass
@@ -16,8 +15,17 @@ from handavatar.animate import PICTURES, RenderOptions, pass_pictures, render_mo
 from handavatar.avatar import HandAvatar
 from handavatar.capture.default import default_capture
 from handavatar.edit import Edit, bones_named
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.evaluate.run import EvaluateOptions, evaluate_run
-from handavatar.jobs.files import FolderInUse, FolderKind, claim_folder, refuse_folder_in_use
+from handavatar.jobs.files import (
+    FolderInUse,
+    FolderKind,
+    claim_folder,
+    refuse_folder_in_use,
+    write_aside,
+    write_atomically,
+)
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.train.loop import TrainOptions, train
 from handavatar.train.runs import RUN
 
@@ -51,9 +59,17 @@ class DemoOptions:
     device: Literal["auto", "cpu", "cuda"] = "auto"
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, steps=(1, 10**8), frames=(1, 10_000), size=(2, 4096), seed=SEEDS)
 
-def run_demo(options: DemoOptions) -> Path:
+
+def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
     """Trains on the shipped capture, judges held-out poses, renders new ones, edits one.
+
+    Args:
+        options: where to, how much.
+        progress: told how far the whole demonstration is.
 
     Leaves ``avatar.safetensors``, ``metrics.json``, ``report.html``, ``overview.png``,
     ``novel_poses.mp4``, ``edits.png`` and the run itself in ``options.out``.
@@ -68,6 +84,10 @@ def run_demo(options: DemoOptions) -> Path:
     run = out / "run"
     claim_folder(out, DEMONSTRATION)
     begin = time.monotonic()
+    frames = float(options.frames)
+    stages = progress.stages(
+        {"training": 300.0, "judging": 40.0, "a video": 1.0 * frames, "edits": 5.0}
+    )
     _say("1/4 training on the shipped capture", begin)
     train(
         TrainOptions(
@@ -76,14 +96,16 @@ def run_demo(options: DemoOptions) -> Path:
             steps=options.steps,
             device=options.device,
             seed=options.seed,
-        )
+        ),
+        stages["training"],
     )
-    shutil.copyfile(run / "avatar.safetensors", out / "avatar.safetensors")
+    _copy(run / "avatar.safetensors", out / "avatar.safetensors")
     _say("2/4 judging held-out poses", begin)
-    metrics = evaluate_run(EvaluateOptions(run=run, device=options.device))
-    shutil.copyfile(run / "evaluation" / "metrics.json", out / "metrics.json")
-    shutil.copyfile(run / "evaluation" / "report.html", out / "report.html")
-    Image.fromarray(overview(run / "evaluation")).save(out / "overview.png")
+    metrics = evaluate_run(EvaluateOptions(run=run, device=options.device), stages["judging"])
+    _copy(run / "evaluation" / "metrics.json", out / "metrics.json")
+    _copy(run / "evaluation" / "report.html", out / "report.html")
+    with write_aside(out / "overview.png") as aside:
+        Image.fromarray(overview(run / "evaluation")).save(aside)
     _say("3/4 a video of poses it never saw", begin)
     renders = _folder_of_pictures(run / "renders")
     render_motion(
@@ -94,19 +116,25 @@ def run_demo(options: DemoOptions) -> Path:
             frames=options.frames,
             overwrite=True,
             device=options.device,
-        )
+        ),
+        stages["a video"],
     )
-    shutil.copyfile(renders / "rgb.mp4", out / "novel_poses.mp4")
+    _copy(renders / "rgb.mp4", out / "novel_poses.mp4")
+    stages["edits"](0.0)
     _say("4/4 edits", begin)
-    Image.fromarray(edited_pictures(HandAvatar.load(out / "avatar.safetensors"))).save(
-        out / "edits.png"
-    )
+    with write_aside(out / "edits.png") as aside:
+        edits = edited_pictures(HandAvatar.load(out / "avatar.safetensors"))
+        Image.fromarray(edits).save(aside)
     _say(
         f"done: {metrics['paper']['psnr']:.1f} dB (paper's protocol), "
         f"mask IoU {metrics['mask_iou']:.3f}; open {out / 'report.html'}",
         begin,
     )
     return out
+
+
+def _copy(source: Path, target: Path) -> None:
+    write_atomically({target: source.read_bytes()})
 
 
 def _folder_of_pictures(renders: Path) -> Path:

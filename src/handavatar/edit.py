@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from handavatar.errors import ArgumentError
 from handavatar.field.anchors import Neighbours
 from handavatar.hand.pose import BONE_NAMES, FINGER_BONES
 
@@ -118,8 +119,9 @@ def bones_named(names: tuple[str, ...]) -> tuple[int, ...]:
         elif name in BONE_NAMES:
             bones.append(BONE_NAMES.index(name))
         else:
-            raise ValueError(
-                f"--lift-shadow: '{name}' is neither a finger nor a bone; choose from "
-                f"{', '.join([*FINGER_BONES, *BONE_NAMES])}"
+            raise ArgumentError(
+                "lift_shadow",
+                f"'{name}' is neither a finger nor a bone; choose from "
+                f"{', '.join([*FINGER_BONES, *BONE_NAMES])}",
             )
     return tuple(dict.fromkeys(bones))

@@ -8,11 +8,15 @@ from dataclasses import dataclass
 import torch
 import torch.distributed
 
+from handavatar.errors import ErrorKind, HandAvatarError
+
 _OF_TORCHRUN = ("RANK", "MASTER_ADDR", "MASTER_PORT")
 
 
-class ProcessesError(ValueError):
+class ProcessesError(HandAvatarError):
     """An environment that speaks of several processes, but does not say where they are."""
+
+    kind = ErrorKind.USAGE
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,7 @@ class Processes:
 
 def is_first_process() -> bool:
     """Whether this process is alone, or the one of ``torchrun``'s that reports."""
-    return os.environ.get("RANK", "0") == "0"
+    return os.environ.get("WORLD_SIZE", "1") == "1" or os.environ.get("RANK", "0") == "0"
 
 
 def _count() -> int:

@@ -1,6 +1,5 @@
 """Edits from words and pictures: what the command line's flags mean, and avatars that keep them."""
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +11,9 @@ from torch import Tensor
 from handavatar.avatar import HandAvatar
 from handavatar.capture.checks import CaptureError, decoded, open_picture
 from handavatar.edit import Edit, Paint, bones_named
+from handavatar.errors import ArgumentError, HandAvatarError, require_range, require_ranges
 from handavatar.hand.rig import Rig
+from handavatar.jobs.files import refuse_file_in_use
 
 _UNSEEN_COLOR = (0.85, 0.1, 0.75)
 _UNSEEN_OPACITY = 0.7
@@ -36,6 +37,10 @@ class Look:
     lift_shadow: str = ""
     paint: Path | None = None
     light: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, light_gain=(0, 1000), light=(0, 10**6))
 
     def check_look(self) -> None:
         """Refuses words that mean nothing, before anything is read.
@@ -61,14 +66,10 @@ class Look:
         try:
             red, green, blue = (float(word) for word in self.albedo_shift.split(","))
         except ValueError as error:
-            raise ValueError(
-                f"--albedo-shift {self.albedo_shift}: expected three numbers, such as 0.1,0,-0.05"
+            raise ArgumentError(
+                "albedo_shift", self.albedo_shift, "three numbers, such as 0.1,0,-0.05"
             ) from error
-        numbers = (self.light_gain, red, green, blue)
-        if not all(math.isfinite(value) for value in numbers) or self.light_gain < 0:
-            raise ValueError(
-                "--light-gain and --albedo-shift: expected finite numbers, gain not below 0"
-            )
+        require_range("albedo_shift", (red, green, blue), -1, 1)
         return red, green, blue
 
     def _bones(self) -> tuple[int, ...]:
@@ -96,12 +97,12 @@ def save_edited(options: EditOptions) -> Path:
 
     Raises:
         CheckpointError: if the avatar cannot be read.
-        CaptureError: if the picture of the paint cannot be read, or the file is there already.
+        CaptureError: if the picture of the paint cannot be read.
+        FolderInUse: if the file is there already.
         ValueError: what cannot be understood.
     """
     options.check_look()
-    if options.out.exists() and not (options.overwrite and options.out.is_file()):
-        raise CaptureError(f"{options.out} exists", "name another file, or use --overwrite")
+    refuse_file_in_use(options.out, options.overwrite)
     avatar = HandAvatar.load(options.run)
     avatar.edit = avatar.edit.then(options.edit_on(avatar))
     avatar.save(options.out)
@@ -144,10 +145,12 @@ def tint_unseen(avatar: HandAvatar) -> Edit:
     """Paint on the skin that no training frame has seen; its look there is a guess.
 
     Raises:
-        ValueError: if the avatar does not know what was seen.
+        HandAvatarError: if the avatar does not know what was seen.
     """
     if avatar.seen_frames is None:
-        raise ValueError("this avatar does not know what was seen: train it with this version")
+        raise HandAvatarError(
+            "this avatar does not know what was seen", "", "train it with this version"
+        )
     unseen = (avatar.seen_frames == 0).to(avatar.anchor_barycentric)
     colors = unseen.new_tensor(_UNSEEN_COLOR).expand(len(unseen), 3)
     return Edit(paint=Paint(colors, _UNSEEN_OPACITY * unseen))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from told import Told
 
 from handavatar.bench import registration
 from handavatar.bench.measures import COLUMNS
@@ -53,8 +54,8 @@ def test_noise_is_told_row_by_row(
         seeds=(0, 1),
         keep=tmp_path,
     )
-    steps: list[int] = []
-    table = registration_table(options, steps.append)
+    told = Told()
+    table = registration_table(options, told.progress)
     record = json.loads(json.dumps(table.record()))
     assert set(record) == {"noise5", "noise5/tiny-0", "noise5/tiny-1"}
     for rows in record.values():

@@ -3,6 +3,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from told import Told
 
 from handavatar.capture import benchmark
 from handavatar.capture.benchmark import (
@@ -72,10 +73,14 @@ def test_the_same_bits_every_time(tmp_path: Path, tiny_size: None) -> None:
 
 
 def test_what_is_there_is_not_made_again(tmp_path: Path, tiny_size: None) -> None:
-    seen: list[str] = []
+    told = Told()
     options = BenchmarkOptions(only=("light-colored-direct", "light-key-pose5"))
-    folders = make_benchmark(tmp_path, options, lambda done, name: seen.append(name))
-    assert seen == ["light-key", "light-colored-direct", "light-key-pose5"]
+    folders = make_benchmark(tmp_path, options, told.progress)
+    assert list(dict.fromkeys(job for job, _, _ in told.counts)) == [
+        "light-key",
+        "light-colored-direct",
+        "light-key-pose5",
+    ]
     times = [(folder / "transforms.json").stat().st_mtime_ns for folder in folders]
     for folder in folders:
         assert find_problems(folder) == []

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from made_hands import FOCAL, made_fit, made_hand
+from told import Told
 
 from handavatar.capture import video as video_module
 from handavatar.capture.checks import CaptureError
@@ -24,6 +25,7 @@ from handavatar.capture.video import VideoOptions, capture_video
 from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.rotations import apply_rigid, matrix_from_axis_angle, rigid_transform
 from handavatar.hand.open_hand import load_open_hand
+from handavatar.jobs.progress import SILENT
 
 FIT = FitOptions(landmark_steps=60)
 REGISTER = RegisterOptions(restarts=0, texture_sigmas=())
@@ -47,9 +49,9 @@ def test_two_recordings_have_one_shape_and_times_that_go_on() -> None:
     rig = load_open_hand("778")
     clips = one_after_the_other([_clip([0, 1]), replace(_clip([2, 0]), focal=FOCAL)])
     assert [clip.start for clip in clips] == pytest.approx([0.0, 1.1])
-    told: list[float] = []
-    laid = lay_hand(clips, rig, FIT, REGISTER, lambda share, doing: told.append(share))
-    assert told == sorted(told)
+    told = Told()
+    laid = lay_hand(clips, rig, FIT, REGISTER, told.progress)
+    assert told.shares == sorted(told.shares)
     first, second = (clip.fitted.fit for clip in laid)
     assert torch.equal(first.shape_coefficients, second.shape_coefficients)
     # What is known stays, to rounding.
@@ -74,7 +76,7 @@ def test_poses_of_a_moving_camera_are_in_the_world() -> None:
     apart = [replace(hand, time=float(place)) for place, hand in enumerate(still.track.hands)]
     for_both = replace(still.track, hands=tuple(apart))
     laid = [
-        lay_hand([replace(clip, track=for_both)], rig, FIT, REGISTER, lambda share, doing: None)[0]
+        lay_hand([replace(clip, track=for_both)], rig, FIT, REGISTER, SILENT)[0]
         for clip in (still, moving)
     ]
     cameras = laid[1].clip.world_cameras
@@ -121,5 +123,5 @@ def test_every_video_has_its_own_masks_and_camera() -> None:
         ((Path("m"),), (Path("c"),)),
         ((Path("n"),), (Path("d"),)),
     ]
-    with pytest.raises(ValueError, match="--masks names 1, expected one for each of 2 videos"):
+    with pytest.raises(ValueError, match="`masks`: found 1, expected one for each of 2 videos"):
         replace(options, masks=(Path("m"),)).of_each_clip()

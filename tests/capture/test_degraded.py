@@ -14,6 +14,7 @@ from handavatar.capture.degraded import DegradeOptions, degrade_capture
 from handavatar.capture.frames import read_capture
 from handavatar.capture.motion import read_motion
 from handavatar.capture.soundness import find_problems
+from handavatar.errors import ArgumentError
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 
 
@@ -71,7 +72,7 @@ def test_masks_shrink_and_pictures_blur_as_the_libraries_say(
     "wrong", [{"pose_noise": -1.0}, {"pose_noise": 90.0}, {"jpeg": 0}, {"mask_erosion": 100}]
 )
 def test_what_makes_no_sense_is_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(CaptureError, match=f"{next(iter(wrong))} is .*expected"):
+    with pytest.raises(ArgumentError, match=f"`{next(iter(wrong))}`: found .*expected"):
         DegradeOptions(Path("x"), **wrong)  # type: ignore[arg-type]
 
 

@@ -37,6 +37,7 @@ from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.cameras import project
 from handavatar.geometry.rotations import apply_rigid, matrix_from_axis_angle, rigid_transform
 from handavatar.hand.pose_sampling import limit_excess
+from handavatar.jobs.progress import SILENT
 
 MISSED, UNSEEN, MISTAKEN, UNSURE, TORN = 4, 8, 10, 12, 14
 """Pictures in which the detector errs, each in its own way."""
@@ -196,7 +197,7 @@ def test_known_cameras_of_a_left_hand_are_mirrored_with_it(
     options = VideoOptions(folder, tmp_path / "out", fps=30.0, camera=(tmp_path,))
     finder = TruthfulFinder(film, is_mirrored=True)
     clip = video_module._tracked_clip(
-        options, film.rig, KnownCamera(lens, "made", known), lambda *_: None, None, lambda: finder
+        options, film.rig, KnownCamera(lens, "made", known), SILENT, None, lambda: finder
     )
     assert clip.track.side == "left" and clip.camera_from_world is not None
     assert clip.track.principal_point == (WIDTH - 60.0, 70.0)

@@ -37,7 +37,7 @@ def test_all_pictures_are_taken_in_the_order_of_their_numbers(tmp_path: Path) ->
     assert [frame.time for frame in frames] == pytest.approx([n / 5 for n in range(12)])
     assert notes == [
         "1 files that are no pictures were left out",
-        "pictures tell no times: they are taken as 5 a second (--fps)",
+        "pictures tell no times: they are taken as 5 a second (`fps`)",
     ]
 
 

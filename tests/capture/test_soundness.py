@@ -12,6 +12,7 @@ import torch
 from bad_captures import BAD_CAPTURES, BadCapture, copied
 from conftest import lit_frame, write_tiny_capture
 from scipy.ndimage import binary_dilation, distance_transform_edt
+from told import Told
 
 from handavatar.capture.agreement import SkinColors, SmallFrame, shifted
 from handavatar.capture.checks import CaptureError
@@ -70,10 +71,10 @@ def test_at_least_78_of_80_bad_captures_are_caught(tmp_path: Path) -> None:
 
 def test_the_capture_that_ships_is_sound_and_read_in_seconds() -> None:
     begin = time.process_time()
-    told: list[tuple[int, int]] = []
+    told = Told()
     folder = default_capture().folder
-    assert find_problems(folder, lambda done, total: told.append((done, total))) == []
-    assert told[-1] == (100, 100)
+    assert find_problems(folder, told.progress) == []
+    assert told.counts[-1] == ("test", 100, 100)
     # 1.5 s of one core for 100 frames; several times that with the type checks of the tests.
     assert time.process_time() - begin < 15
 

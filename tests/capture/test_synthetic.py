@@ -17,6 +17,7 @@ from handavatar.capture.synthetic import (
     motion_for_testing,
     motion_for_training,
 )
+from handavatar.errors import ArgumentError
 from handavatar.geometry.cameras import project
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.detail import subdivided
@@ -123,7 +124,7 @@ def test_depth_and_normals_are_those_of_the_hand(capture):
 
 @pytest.mark.parametrize("options", [{"train_frames": 0}, {"size": 2}, {"tone": 1.5}])
 def test_options_that_cannot_be_rendered_are_refused(options):
-    with pytest.raises(CaptureError, match=next(iter(options))):
+    with pytest.raises(ArgumentError, match=next(iter(options))):
         SynthOptions(**options)
 
 

@@ -73,7 +73,7 @@ def test_two_hands_all_along_are_refused() -> None:
     both = [_sighting(True), _sighting(False, 150)]
     with pytest.raises(UnusableTrackError, match="two hands in 4 of 20") as caught:
         track_hand(_frames(20), finder=_Finder({i: both for i in range(4)}))
-    assert "--hand left" in caught.value.remedy
+    assert "`hand='left'`" in caught.value.remedy
     assert len(caught.value.track.hands) == 16 and len(caught.value.track.skipped) == 4
 
 

@@ -12,6 +12,7 @@ from made_hands import CORNER, FOCAL, PICTURE, SIDE, made_fit, made_hand
 from PIL import Image
 from safetensors.torch import load_file
 from scipy import ndimage
+from told import Told
 from videos import REAL_VIDEO, grey_levels, needs_real_video, save_video
 
 from handavatar.capture import clips as clips_module
@@ -93,7 +94,7 @@ def test_both_hands_are_two_captures() -> None:
     ]
     alone = replace(options, hand="larger")
     assert alone.of_each_hand() == [alone]
-    with pytest.raises(ValueError, match="--hand both makes two captures"):
+    with pytest.raises(ValueError, match="`hand`: both makes two captures"):
         track_video(options)
 
 
@@ -132,7 +133,7 @@ def test_a_hand_wholly_in_the_picture_is_kept_and_known(
     assert sum(split["pictures"] for split in summary["splits"].values()) == _MADE
     assert summary["border"]["frames"] == 0
     lines = summary_lines(summary)
-    assert "--side left overrules it" in lines[0]
+    assert "`side='left'` overrules it" in lines[0]
     assert lines[1] == f"frames: {_MADE} of {_MADE} kept"
     frame = capture.frame(0)
     # All but the cut across the wrist.
@@ -274,17 +275,17 @@ def test_a_folder_in_use_is_refused_before_any_work(tmp_path: Path) -> None:
 @needs_real_video
 def test_the_real_hand_becomes_a_sound_capture(tmp_path: Path) -> None:
     pytest.importorskip("mediapipe")
-    told: list[float] = []
+    told = Told()
     options = VideoOptions(
         REAL_VIDEO,
         tmp_path / "out",
         max_frames=10,
         fit=FitOptions(landmark_steps=120, outline_steps=90, retry_steps=20),
     )
-    capture = capture_video(options, progress=lambda share, doing: told.append(share))
+    capture = capture_video(options, progress=told.progress)
     assert find_problems(capture.folder) == []
     assert capture.side == "right" and len(capture.records) == 10
-    assert told == sorted(told) and told[-1] == 1.0
+    assert told.shares == sorted(told.shares) and told.shares[-1] == 1.0
     skipped = json.loads((capture.folder / "skipped.json").read_text())
     assert skipped == {"frames": {}, "reasons": {}}
     fit = json.loads((capture.folder / "fit.json").read_text())

@@ -215,7 +215,7 @@ def test_the_unit_is_found_from_a_hand_held_still() -> None:
     wandering = seen + 0.2 * torch.randn(20, 3, generator=generator)
     with pytest.raises(CaptureError, match="the hand moved about as much") as caught:
         metres_of_unit(views, wandering)
-    assert "--camera-unit" in caught.value.remedy
+    assert "`camera_unit`" in caught.value.remedy
     still = views[:1].expand(20, 4, 4)
     with pytest.raises(CaptureError, match="cannot be told"):
         metres_of_unit(still, noisy)

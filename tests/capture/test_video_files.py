@@ -366,18 +366,18 @@ def test_a_part_is_taken_and_what_is_not_looked_at_is_said(tmp_path: Path) -> No
     notes.clear()
     list(video_frames(path, Sampling(10.0), notes.append))
     assert notes == []
-    with pytest.raises(CaptureError, match=r"--start 7 lies behind its end at 2\.0 seconds"):
+    with pytest.raises(CaptureError, match=r"`start=7` lies behind its end at 2\.0 seconds"):
         list(video_frames(path, Sampling(10.0, start=7.0)))
 
 
 @pytest.mark.parametrize(
     ("wrong", "word"),
     [
-        ({"fps": 0.0}, "--fps 0"),
-        ({"fps": math.nan}, "--fps nan"),
-        ({"max_frames": 0}, "--max-frames 0"),
-        ({"start": -1.0}, "--start -1"),
-        ({"start": 3.0, "end": 3.0}, "--end 3"),
+        ({"fps": 0.0}, "`fps`: found 0"),
+        ({"fps": math.nan}, "`fps`: found nan"),
+        ({"max_frames": 0}, "`max_frames`: found 0"),
+        ({"start": -1.0}, "`start`: found -1"),
+        ({"start": 3.0, "end": 3.0}, "`end`: found 3, expected more than `start=3`"),
     ],
 )
 def test_what_selects_nothing_is_refused(wrong: dict[str, float], word: str) -> None:

@@ -2,6 +2,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from told import Told
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.checks import CaptureError
@@ -60,9 +61,9 @@ def test_the_table_judges_every_avatar_where_the_shadow_falls(
     options = LiftTableOptions(
         capture.folder, (tmp_path / "a.safetensors",), ("thumb", "middle+ring"), 2, samples=16
     )
-    done: list[int] = []
-    table = lift_table(options, done.append)
-    assert done == list(range(1, options.total_steps + 1))
+    told = Told()
+    table = lift_table(options, told.progress)
+    assert told.steps == list(range(1, options.total_steps + 1))
     assert list(table.rows) == ["thumb: a.safetensors", "middle+ring: a.safetensors"]
     (tmp_path / "b").mkdir()
     small_avatar.save(tmp_path / "b" / "a.safetensors")

@@ -162,7 +162,7 @@ def test_a_folder_of_something_else_is_not_written_into(
 ) -> None:
     (tmp_path / "000003.png").write_text("a holiday")
     options = EvaluateOptions(avatar_file, tiny_capture, out=tmp_path, device="cpu")
-    with pytest.raises(FolderInUse, match="not empty, and holds no evaluation"):
+    with pytest.raises(FolderInUse, match="holds no evaluation of this program's"):
         evaluate_run(options)
     assert [path.read_text() for path in tmp_path.iterdir()] == ["a holiday"]
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 import torch
 from conftest import bent_pose
+from told import Told
 
 from handavatar.avatar import HandAvatar
 from handavatar.evaluate.speed_table import (
@@ -34,8 +35,8 @@ def options(
 
 @pytest.mark.slow
 def test_the_ways_are_timed_on_the_same_pictures(options: SpeedTableOptions) -> None:
-    told: list[int] = []
-    table = speed_table(options, told.append)
+    told = Told()
+    table = speed_table(options, told.progress)
     assert list(table.rows) == [
         *("plain", "exact", "near-exact", "exact, 3 hands", "near-exact, 3 hands"),
         *("exact, 8 pixels", "near-exact, 8 pixels"),
@@ -45,7 +46,7 @@ def test_the_ways_are_timed_on_the_same_pictures(options: SpeedTableOptions) -> 
     assert isinstance(near["PSNR"], float) and near["PSNR"] > 60
     work = [table.rows[name]["TFLOP"] for name in ("plain", "exact", "near-exact")]
     assert work[0] > work[1] > work[2] > 0  # type: ignore[operator]
-    assert told[-1] == options.total_steps
+    assert told.steps[-1] == options.total_steps
     assert json.loads(json.dumps(table.record(), allow_nan=False)) is not None
     shown = table.markdown()
     assert "2 poses of 16x16 pixels" in shown and "ms a hand" in shown

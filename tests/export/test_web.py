@@ -31,7 +31,7 @@ def quick_fit() -> Any:
         patch.setattr(
             run,
             "lightweight_hand",
-            lambda avatar, edit, tell: lightweight_hand(avatar, edit, tell, Effort(3, 2)),
+            lambda avatar, edit, progress: lightweight_hand(avatar, edit, progress, Effort(3, 2)),
         )
         yield
 

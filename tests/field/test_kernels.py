@@ -17,7 +17,7 @@ def test_torch_runs_everywhere(monkeypatch: pytest.MonkeyPatch, is_there: bool) 
 def test_a_kernel_that_cannot_run_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernels, "_has_triton", lambda: True)
     assert chosen_kernel("triton-tf32", "cuda:0") == "triton-tf32"
-    with pytest.raises(ValueError, match="--kernel triton: needs a CUDA device, found cpu"):
+    with pytest.raises(ValueError, match="`kernel`: triton needs a CUDA device, found cpu"):
         chosen_kernel("triton", "cpu")
     monkeypatch.setattr(kernels, "_has_triton", lambda: False)
     with pytest.raises(ValueError, match="no package 'triton'"):

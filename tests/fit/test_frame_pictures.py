@@ -141,3 +141,14 @@ def test_scribbling_over_the_unknown_changes_no_bit(rig: Rig) -> None:
         both.append([*parts, picture.hand, picture.has_outline, picture.known])
     assert len(both[0][1]) > 50
     assert all(torch.equal(first, second) for first, second in zip(*both, strict=True))
+
+
+def test_levels_are_the_colors_that_they_stand_for() -> None:
+    picture = _picture(_disc((30.0, 30.0), 12.0))
+    levels = (picture.pixels * 255).round().to(torch.uint8)
+    arguments = (picture.camera, (picture.distance < 0).float(), picture.known, torch.rand(3) + 0.5)
+    camera, coverage, known, gain = arguments
+    small = FramePicture.of(camera, levels, coverage, known, gain)
+    large = FramePicture.of(camera, levels.float() / 255, coverage, known, gain)
+    assert torch.equal(small.color, large.color) and small.pixels.dtype == torch.uint8
+    assert torch.equal(small.band(2.0).channels, large.band(2.0).channels)

@@ -17,6 +17,7 @@ from made_frames import (
     spoilt,
     with_landmarks,
 )
+from told import Told
 
 from handavatar.fit.energy import EnergyOptions, Observation
 from handavatar.fit.pictures import FramePicture
@@ -81,12 +82,13 @@ def _parts(found: Registered) -> list[torch.Tensor]:
 
 def test_the_short_way_comes_nearer_too(rig: Rig, short: Clip) -> None:
     tracked = spoilt(short.truth, 5.0)
-    told: list[float] = []
-    found = register([rig.shaped()], short.observations, tracked, None, QUICK, progress=told.append)
+    told = Told()
+    seen = short.observations
+    found = register([rig.shaped()], seen, tracked, None, QUICK, progress=told.progress)
     before = moved_by(rig.shaped(), tracked, short.truth)
     after = moved_by(rig.shaped(), found.poses, short.truth)
     assert float(after.mean()) < 0.8 * float(before.mean())
-    assert told == sorted(told) and told[-1] == 1.0
+    assert told.shares == sorted(told.shares) and told.shares[-1] == 1.0
     for covariance in found.covariances:
         assert float(torch.linalg.eigvalsh(covariance.double())[0]) > 0
 

@@ -13,6 +13,7 @@ from made_frames import (
     spoilt,
 )
 
+from handavatar.fit import solver
 from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
 from handavatar.fit.kinematics import NUM_UNKNOWNS, moved_pose, pose_difference
 from handavatar.fit.pictures import FramePicture
@@ -202,3 +203,17 @@ def test_no_step_turns_a_joint_by_more_than_twenty_degrees(
     descent.step_poses(Look(0.7, 3.0), 1)
     turned = pose_difference(begin, descent.poses)[:, :-3].abs().amax(-1)
     assert bool((turned > 0.34).all()) and bool((turned < 0.351).all())
+
+
+def test_of_very_many_frames_some_bands_are_made_again_and_nothing_changes(
+    rig: Rig, truth: HandPose, frames: list[Observation], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Memory is bounded; what is not kept has the same values."""
+    look, found = Look(0.7, 3.0), []
+    for room in (len(frames), 2):
+        monkeypatch.setattr(solver, "_MOST_BAND_BYTES", room * 4 * 4 * SIZE**2)
+        descent = _descent(rig.shaped(), frames, spoilt(truth, 6.0), 6.0)
+        descent.step_poses(look, 2)
+        assert len(descent._bands) == room
+        found.append(descent.poses.rotations)
+    assert torch.equal(*found)

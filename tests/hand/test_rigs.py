@@ -12,6 +12,7 @@ from handavatar.hand.mano import ManoModel, read_mano
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.rig import LicensedRigMissing, RigError
 from handavatar.hand.rigs import find_rig, load_mano, load_rig, read_rig, rigs_folder, save_rig
+from handavatar.jobs.files import FolderInUse
 
 
 @pytest.fixture
@@ -61,7 +62,7 @@ def test_the_open_hand_alone_has_levels(model: ManoModel, home: Path) -> None:
         assert load_rig(reference, "778").sha256 == small
     assert load_rig("mano-right", "full").sha256 == model.rig.sha256
     for reference in ("mano-right", str(path)):
-        with pytest.raises(RigError, match=r"found level 778, which the open hand[\s\S]*--level"):
+        with pytest.raises(RigError, match=r"found level 778, which the open hand[\s\S]*`level`"):
             load_rig(reference, "778")
 
 
@@ -94,10 +95,10 @@ def test_two_rigs_of_one_name_are_told_apart_by_their_files(model: ManoModel, ho
 def test_a_file_is_not_replaced_unless_told(model: ManoModel, tmp_path: Path) -> None:
     path = tmp_path / "new" / "rig.safetensors"
     assert save_rig(model, path) == path
-    with pytest.raises(RigError, match="--overwrite"):
+    with pytest.raises(FolderInUse, match="exists"):
         save_rig(model, path)
     save_rig(model, path, overwrite=True)
-    with pytest.raises(RigError, match="--overwrite"):
+    with pytest.raises(FolderInUse, match="is no file"):
         save_rig(model, tmp_path, overwrite=True)
     assert [file.name for file in path.parent.iterdir()] == ["rig.safetensors"]
 

@@ -236,7 +236,7 @@ def test_a_continued_refinement_is_the_same(problem: SkinRefinement, tmp_path: P
         if state.step == TINY.steps + 2:
             state.save(file, problem)
 
-    whole = refine_skin(problem, report=keep)
+    whole = refine_skin(problem, after_step=keep)
     continued = refine_skin(problem, RefinementState.load(file, problem))
     assert torch.equal(whole.fitted, continued.fitted) and torch.equal(whole.free, continued.free)
     other = replace(problem, options=replace(TINY, seed=1))

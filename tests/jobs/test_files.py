@@ -2,6 +2,8 @@
 
 import json
 import os
+import socket
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,17 +17,23 @@ from handavatar.jobs.files import (
     FolderKind,
     UnfinishedFolder,
     claim_folder,
+    fill_folder,
     make_folder,
     mark_folder,
     name_files,
     read_marker,
+    refuse_file_in_use,
     refuse_folder_in_use,
     remove_folder,
     restore_folder,
     strangers_in,
     swap_folder,
+    write_aside,
     write_atomically,
 )
+
+HOST = socket.gethostname()
+DEAD = 2**22 + 1  # above any process number of Linux
 
 SONGS = FolderKind("songs", ("*.mp3", "sheets/*.pdf"), lambda folder: (folder / "a.mp3").is_file())
 FILMS = FolderKind("films", ("*.mp4",))
@@ -186,11 +194,31 @@ def test_an_old_folder_is_replaced_by_a_new_one(tmp_path: Path) -> None:
     assert _texts(place) == {"a.mp3": "new"} and list(tmp_path.iterdir()) == [place]
 
 
+EXCHANGES = pytest.mark.parametrize("exchanges", [True, False])
+"""Whether the system can exchange two names in one step."""
+
+
+def _system(monkeypatch: pytest.MonkeyPatch, exchanges: bool) -> None:
+    if not exchanges:
+        monkeypatch.setattr(files, "_exchange", lambda first, second: False)
+    elif sys.platform != "linux":
+        pytest.skip("only Linux exchanges names")
+
+
+@EXCHANGES
 @pytest.mark.parametrize("error", [OSError("no"), KeyboardInterrupt()])
-@pytest.mark.parametrize("failing", [0, 1])
+@pytest.mark.parametrize("failing", [0, 1, 2])
 def test_a_failure_between_the_renames_leaves_the_old_one_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, failing: int
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    error: BaseException,
+    failing: int,
+    exchanges: bool,
 ) -> None:
+    _system(monkeypatch, exchanges)
+    if exchanges and failing:
+        monkeypatch.setattr(files, "_exchange", _raising(error))
+        failing = 20
     place, whole = _made(tmp_path / "place"), _made(tmp_path / "whole", "new")
     rename, renames = os.rename, []
 
@@ -207,28 +235,38 @@ def test_a_failure_between_the_renames_leaves_the_old_one_whole(
     assert sorted(tmp_path.iterdir()) == [place, whole]
 
 
+def _raising(error: BaseException) -> Callable[..., bool]:
+    def call(*_: object) -> bool:
+        raise error
+
+    return call
+
+
 class _Killed(BaseException):
     """As if the process were gone: nothing is put right after it."""
 
 
+@EXCHANGES
 def test_a_kill_at_any_moment_of_a_swap_leaves_old_or_new_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exchanges: bool
 ) -> None:
     """The process ends before each call that changes the disk; then the next one goes on."""
+    _system(monkeypatch, exchanges)
     calls = [(files.os, "rename"), (files.Path, "unlink"), (files.Path, "rmdir")]
+    calls += [(files, "_exchange")] * exchanges
     for moment in range(20):
         room = tmp_path / str(moment)
         room.mkdir()
         place, whole = _made(room / "place"), _made(room / "whole", "new")
         done = 0
 
-        def dying(real: Callable[..., None], moment: int = moment) -> Callable[..., None]:
-            def call(*arguments: object, **named: object) -> None:
+        def dying(real: Callable[..., object], moment: int = moment) -> Callable[..., object]:
+            def call(*arguments: object, **named: object) -> object:
                 nonlocal done
                 if done >= moment:
                     raise _Killed
                 done += 1
-                real(*arguments, **named)
+                return real(*arguments, **named)
 
             return call
 
@@ -243,17 +281,22 @@ def test_a_kill_at_any_moment_of_a_swap_leaves_old_or_new_whole(
         hidden = [path for path in room.iterdir() if path.name.startswith(".place.replaced-")]
         kept = [_texts(path) for path in (place, *hidden, whole) if path.exists()]
         assert {"a.mp3": "new"} in kept
+        if exchanges:
+            assert _texts(place) in ({"a.mp3": "old"}, {"a.mp3": "new"}), "at every moment one"
         if whole.exists():
             assert {"a.mp3": "old"} in kept, "nothing is removed before the new one is in place"
             restore_folder(place)
             assert _texts(place) == {"a.mp3": "old"}
             swap_folder(whole, place, SONGS, overwrite=True)
         else:
+            restore_folder(place)
+            assert _texts(place) in ({"a.mp3": "old"}, {"a.mp3": "new"})
             swap_folder(_made(room / "whole", "new"), place, SONGS, overwrite=True)
         assert _texts(place) == {"a.mp3": "new"} and list(room.iterdir()) == [place]
         if is_through:
             break
-    assert moment == 5, "two renames, and three steps of removing: file, marker, folder"
+    renames = 2 if exchanges else 3
+    assert moment == renames + 3, "and three steps of removing: file, marker, folder"
 
 
 def test_folders_written_in_place_go_on_in_their_own_only(tmp_path: Path) -> None:
@@ -272,6 +315,75 @@ def test_folders_written_in_place_go_on_in_their_own_only(tmp_path: Path) -> Non
     with pytest.raises(FolderInUse, match="is a file"):
         claim_folder(tmp_path / "file", SONGS)
     assert (tmp_path / "new" / "f").read_text() == "mine"
+
+
+def test_a_folder_takes_its_place_when_it_is_filled(tmp_path: Path) -> None:
+    place = tmp_path / "deep" / "place"
+    with fill_folder(place, SONGS) as folder:
+        (folder / "sheets").mkdir()
+        (folder / "sheets" / "a.pdf").write_text("new")
+        assert folder.parent == place.parent and folder.name.startswith(".") and not place.exists()
+    marker = read_marker(place)
+    assert marker is not None and marker["files"] == ["sheets/a.pdf"] and "process" not in marker
+    assert place.stat().st_mode == (tmp_path / "deep").stat().st_mode, "the user's usual mode"
+    with pytest.raises(FolderInUse, match="not empty"), fill_folder(place, SONGS):
+        pytest.fail("refused before anything is done")
+    with (
+        pytest.raises(KeyboardInterrupt),
+        fill_folder(place, SONGS, overwrite=True) as folder,
+    ):
+        (folder / "a.mp3").write_text("half")
+        raise KeyboardInterrupt
+    assert _texts(place) == {"sheets/a.pdf": "new"}
+    with fill_folder(place, SONGS, overwrite=True) as folder:
+        (folder / "a.mp3").write_text("newer")
+    assert _texts(place) == {"a.mp3": "newer"}
+    assert list(place.parent.iterdir()) == [place]
+
+
+def test_what_a_killed_process_left_of_a_folder_goes_and_nothing_else(tmp_path: Path) -> None:
+    """Only what a dead process of this machine has marked; the first process never dies."""
+    names = {"dead": ("songs", HOST, DEAD), "alive": ("songs", HOST, 1)}
+    names |= {"elsewhere": ("songs", "other", DEAD), "films": ("films", HOST, DEAD)}
+    for name, (kind, host, process) in names.items():
+        left = tmp_path / f".place.unfinished-{name}"
+        left.mkdir()
+        mark_folder(left, FolderKind(kind), {"host": host, "process": process})
+    (tmp_path / ".place.unfinished-mine").mkdir()
+    with fill_folder(tmp_path / "place", SONGS) as folder:
+        (folder / "a.mp3").write_text("new")
+    left = {path.name for path in tmp_path.iterdir()} - {"place"}
+    assert left == {f".place.unfinished-{name}" for name in ("alive", "elsewhere", "films", "mine")}
+
+
+def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / f"{'x' * 250}.txt"  # as long as names may be, almost
+    write_atomically({path: b"old"})
+    with pytest.raises(KeyboardInterrupt), write_aside(path) as aside:
+        aside.write_text("half")
+        assert aside.suffix == ".txt" and aside.parent == path.parent
+        raise KeyboardInterrupt
+    assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
+    neighbour = tmp_path / "a.tmp"  # Nothing beside is touched.
+    neighbour.write_text("mine")
+    write_atomically({tmp_path / "a": b"new", path: b"new"}, is_durable=False)
+    assert neighbour.read_text() == "mine" and path.read_bytes() == b"new"
+    assert path.stat().st_mode == neighbour.stat().st_mode, "the user's usual mode"
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "link"])
+def test_a_file_in_use_is_refused(tmp_path: Path, kind: str) -> None:
+    place = tmp_path / "place"
+    refuse_file_in_use(place)
+    if kind == "file":
+        place.write_text("mine")
+        refuse_file_in_use(place, overwrite=True)
+    elif kind == "folder":
+        place.mkdir()
+    else:
+        place.symlink_to(tmp_path / "nowhere")
+    with pytest.raises(FolderInUse, match="exists" if kind == "file" else "is no file"):
+        refuse_file_in_use(place, overwrite=kind != "file")
 
 
 def _unfinished(target: Path, record: int = 1) -> UnfinishedFolder:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from conftest import TINY, bent_pose
+from told import Told
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame, read_capture
@@ -125,12 +126,12 @@ def test_the_table_is_kept_and_has_every_row(
     monkeypatch.setitem(METHODS, "quick", replace(TINY, cues=TracedCues()))
     monkeypatch.setattr(textured_mesh, "NUM_TEXELS", 500)
     options = PeersTableOptions((tiny_capture,), tmp_path, seeds=(0,), steps=2, peer_steps=2)
-    done: list[int] = []
-    found = peers_table(options, done.append)
+    told = Told()
+    found = peers_table(options, told.progress)
     assert list(found.rows) == [*table.PEERS, *table.OURS]
     assert sum(" minus " in note for note in found.notes) == len(table.PEERS) * len(table.OURS)
     assert "ours (best) minus textured mesh: ssim " in found.markdown()
-    assert done[-1] == options.total_steps
+    assert told.steps[-1] == options.total_steps
     stored = json.loads((tmp_path / f"peers-{tiny_capture.name}.json").read_text())
     assert len(stored["rows"]["textured mesh"]["0"]["psnr"]) == 2
     assert str(found.rows["inverse skinning"]["ours (best) ahead by"]).count("[") == 1

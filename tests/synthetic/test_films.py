@@ -10,6 +10,7 @@ import torch
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import Sampling, video_frames
+from handavatar.errors import ArgumentError
 from handavatar.geometry.cameras import project
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose_sampling import PenetrationProbe, limit_excess
@@ -86,7 +87,7 @@ def test_gains_drift_about_one() -> None:
 
 
 def test_films_that_cannot_be_made_are_refused() -> None:
-    with pytest.raises(CaptureError, match="seconds is 0"):
+    with pytest.raises(ArgumentError, match="`seconds`: found 0"):
         FilmOptions("none", 1, seconds=0.0)
     with pytest.raises(CaptureError, match="no gesture"):
         natural_motion(load_open_hand(), replace(FILMS[0], gestures=("relaxed", "nonsense")))

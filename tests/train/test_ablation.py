@@ -11,6 +11,7 @@ import pytest
 import torch
 from conftest import TINY
 from PIL import Image
+from told import Told
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.frames import read_capture
@@ -137,9 +138,9 @@ def test_the_table_is_kept_and_paired(
         if name.startswith("control") or name.endswith((" (quick)", " (best)")):
             monkeypatch.delitem(ROWS, name)
     options = AblationTableOptions((made,), tmp_path / "kept", seeds=(0, 1), steps=2)
-    done: list[int] = []
-    table = ablation_table(options, done.append)
-    assert done == list(range(1, options.total_steps + 1))
+    told = Told()
+    table = ablation_table(options, told.progress)
+    assert told.steps == list(range(1, options.total_steps + 1))
     assert list(table.rows) == list(ROWS)
     with Image.open(tmp_path / "kept" / "light-key.png") as sheet:
         assert sheet.size == (48 * (1 + len(ROWS)), 48 * 6)
@@ -181,7 +182,7 @@ def test_some_rows_of_a_capture_without_truth_and_then_more(
     assert row["albedo"] is None and row["shading r"] is None and row["gain, all"] is None
     assert row["against"] is None and float(str(row["psnr"])) > 5
     both = replace(options, rows=("(paper)", "traced light"))
-    done: list[int] = []
+    told = Told()
     train, trainings = ablation.trained_shading, []
 
     def counted(row: Row, *rest: Any) -> Shading:
@@ -189,13 +190,13 @@ def test_some_rows_of_a_capture_without_truth_and_then_more(
         return train(row, *rest)
 
     monkeypatch.setattr(ablation, "trained_shading", counted)
-    table = ablation_table(both, done.append)
-    assert len(done) == both.total_steps == 3
+    table = ablation_table(both, told.progress)
+    assert len(told.steps) == both.total_steps == 3
     assert table.rows["+ directed occupancy (paper)"] == row
     assert table.rows["traced light"]["gain, all"] is not None
     # Poses are known: with corrected ones it is the same training, which is not done again.
     assert table.rows["traced light, poses corrected (best)"] == table.rows["traced light"]
     assert trainings == [ROWS["traced light"]]
     assert ablation_table(replace(options, rows=("(paper)",))) == first
-    with pytest.raises(ValueError, match="--rows sunlight: no row"):
+    with pytest.raises(ValueError, match="`rows`: no row is called sunlight"):
         ablation_table(replace(options, rows=("sunlight",)))

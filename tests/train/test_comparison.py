@@ -9,6 +9,7 @@ from typing import Any, get_args
 
 import pytest
 import torch
+from told import Told
 
 from handavatar.field.decoders import Decoder, OccupancyField
 from handavatar.field.occupancy import HandCodes
@@ -204,8 +205,8 @@ def test_the_table_has_a_row_per_decoder_and_says_what_it_rests_on(tmp_path: Pat
         "resolution": 16,
     }
     options = GeometryTableOptions(**(vars(_options(tmp_path)) | wanted))
-    told: list[int] = []
-    table = geometry_table(options, told.append)
+    told = Told()
+    table = geometry_table(options, told.progress)
     assert list(table.rows) == ["pair", "coap", "coap-guide-1"]
     assert table.rows["pair"]["parameters"] == 232_513
     assert table.rows["pair"]["IoU - pair [95 % over poses]"] is None
@@ -213,7 +214,7 @@ def test_the_table_has_a_row_per_decoder_and_says_what_it_rests_on(tmp_path: Pat
     # Two steps make no hand: what has no surface has no figure, never NaN.
     cells = [cell for row in table.rows.values() for cell in row.values()]
     assert all(not isinstance(cell, float) or math.isfinite(cell) for cell in cells)
-    assert options.total_steps == 6 and max(told, default=0) <= 6
+    assert options.total_steps == 6 and max(told.steps, default=0) <= 2
     assert any(note.startswith("coap-guide-1 minus coap: iou ") for note in table.notes)
     assert "2 steps of 64 points" in table.markdown()
     assert json.loads(json.dumps(table.record(), allow_nan=False)) is not None

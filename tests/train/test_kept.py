@@ -119,7 +119,7 @@ def test_figures_of_another_commit_are_refused_unless_they_are_asked_for(
     folder = _stamped(name, tmp_path / "kept", **facts)
     with pytest.raises(CaptureError, match="measured by commit 0123abcd, this is") as caught:
         TABLES[name](capture, folder)
-    assert "--any-commit" in str(caught.value)
+    assert "`any_commit=True`" in str(caught.value)
     table = TABLES[name](capture, folder, True)
     expected = f"light-key: measured by commit 0123abcd, not by this one ({present_commit()}): "
     assert table.notes[-1] == f"{expected}{first}."

@@ -16,6 +16,7 @@ from conftest import TINY, write_tiny_capture
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import read_capture
 from handavatar.hand.open_hand import load_open_hand
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.train import live
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.live import (
@@ -28,7 +29,6 @@ from handavatar.train.live import (
     shown_live,
 )
 from handavatar.train.loop import METHODS, TrainOptions, run_folder, train
-from handavatar.train.progress import Progress
 from handavatar.train.runs import Run, open_run, read_log
 
 STEPS = 6
@@ -114,10 +114,9 @@ def test_poses_of_a_tracked_capture_are_shown_as_training_has_them(
     corrections = PoseCorrections(len(frames))
     moved = replace(frames[1].pose, translation=frames[1].pose.translation + 0.01)
     corrections.set(1, frames[1].pose, moved)
-    with shown_live(run, avatar, corrections, frames):
+    with shown_live(run, avatar, corrections, frames, SILENT) as progress:
         look_on(run)
-        with Progress("train", 3) as progress:
-            progress.update(2, loss=0.5)
+        _stage(progress)(2, 3, loss=0.5)
         shown = HandAvatar.load(live_avatar(run))
         poses = live_poses(shown)
     assert poses is not None
@@ -128,19 +127,22 @@ def test_poses_of_a_tracked_capture_are_shown_as_training_has_them(
     assert live_poses(avatar) is None
 
 
+def _stage(progress: Progress) -> Progress:
+    return progress.stages({"train": 1.0})["train"]
+
+
 def _small() -> HandAvatar:
     return HandAvatar(load_open_hand("778"), torch.zeros(10), rounds=0, num_anchors=64)
 
 
 def test_how_far_it_is_is_said_from_beginning_to_end(run: Run) -> None:
     assert read_live(run) is None
-    with shown_live(run, _small(), None, []):
+    with shown_live(run, _small(), None, [], SILENT) as progress:
         state = read_live(run)
         assert state is not None and state.is_going_on and state.job == ""
-        with Progress("train", 10, 4) as progress:
-            progress.update(5, loss=0.25, psnr=float("nan"))
+        _stage(progress)(5, 10, loss=0.25, psnr=float("nan"))
         state = read_live(run)
-        assert state is not None
+        assert state is not None and state.share == 0.5
         assert (state.job, state.step, state.total, state.figures) == (
             "train",
             5,
@@ -153,22 +155,23 @@ def test_how_far_it_is_is_said_from_beginning_to_end(run: Run) -> None:
     assert state is not None and state.phase == "finished" and not state.is_going_on
     assert [path.name for path in live_folder(run).iterdir()] == ["progress.json"]
     # What is told to nobody goes nowhere.
-    with Progress("train", 1) as progress:
-        progress.update(1)
+    _stage(SILENT)(1, 1)
     assert read_live(run) == state
 
 
 def test_an_interrupted_training_says_so_and_leaves_its_avatar(run: Run, eager: None) -> None:
-    with pytest.raises(KeyboardInterrupt), shown_live(run, _small(), None, []):
+    with (
+        pytest.raises(KeyboardInterrupt),
+        shown_live(run, _small(), None, [], SILENT) as progress,
+    ):
         look_on(run)
-        with Progress("train", 2) as progress:
-            progress.update(1)
-            raise KeyboardInterrupt
+        _stage(progress)(1, 2)
+        raise KeyboardInterrupt
     state = read_live(run)
     assert state is not None and state.phase == "stopped" and not state.is_going_on
     assert live_avatar(run).is_file()
     # Who begins anew takes it away.
-    with shown_live(run, _small(), None, []):
+    with shown_live(run, _small(), None, [], SILENT):
         assert not live_avatar(run).exists()
 
 

@@ -20,10 +20,12 @@ from safetensors.torch import load_file
 from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar
 from handavatar.capture.frames import CaptureError, read_capture
 from handavatar.evaluate.perceptual import perceptual_loss
+from handavatar.field.shading import CueSet, OrientedCues, TracedCues
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand import parts
 from handavatar.hand.parts import divide_into_parts
 from handavatar.hand.rig import RigError
+from handavatar.jobs.progress import Board, Progress
 from handavatar.train import loop
 from handavatar.train.loop import (
     METHODS,
@@ -342,6 +344,62 @@ def test_an_interrupt_saves_and_the_rest_continues(
     _assert_same_end(tmp_path / "run", whole_run)
 
 
+class _StoppedIn:
+    """Tells the process to stop when a stage of a training has come to a step."""
+
+    def __init__(self, job: str, step: int) -> None:
+        self._place = (job, step)
+        self._board = Board("train")
+        self._board.listeners.append(self._hear)
+        self.progress = Progress(self._board)
+
+    def _hear(self, state: dict[str, Any], _: bool) -> None:
+        if (state["job"], state["step"]) == self._place:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+_SOME = (("outlines", 3), ("occupancy", 1), ("samples", 1), ("train", 5), ("detail", 1))
+_REGISTRATION = (("poses", 28), ("poses", 71), ("offsets", 2))
+_BEFORE_STEPS = (("outlines", 3), ("hands", 1), ("occupancy", 1), ("border", 1))
+_WITH_LIGHT = (("samples", 2), ("sky", 1), ("tracing light", 3))
+_STEPS_AND_DETAIL = (("train", 1), ("train", 5), ("views", 2), ("unwrapping", 1), ("detail", 1))
+
+
+@pytest.mark.parametrize(
+    ("confidence", "cues", "places"),
+    [
+        (1.0, OrientedCues(), _SOME),
+        pytest.param(
+            0.9,
+            TracedCues(14),
+            (*_REGISTRATION, *_BEFORE_STEPS, *_WITH_LIGHT, *_STEPS_AND_DETAIL),
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
+def test_stopped_in_every_stage_it_gives_the_same_avatar(
+    confidence: float,
+    cues: CueSet,
+    places: tuple[tuple[str, int], ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    small = replace(TINY, cues=cues, detail_size=32, detail_steps=3)
+    monkeypatch.setitem(METHODS, "quick", small)
+    capture = write_tiny_capture(tmp_path / "capture", confidence=confidence)
+    whole = train(_options(capture, tmp_path / "whole"))
+    options = _options(capture, tmp_path / "run")
+    out, kept = tmp_path / "run", set[str]()
+    for job, step in places:
+        with pytest.raises(Interrupted, match="the same command goes on"):
+            train(options, _StoppedIn(job, step).progress)
+        kept |= {path.name for path in out.glob("*.unfinished*")}
+    assert {name.partition(".")[0] for name in kept} == {"geometry", "samples", "detail"}
+    run = train(options)
+    _assert_same_end(run, whole)
+    assert not list(run.glob("*.unfinished*"))
+
+
 def test_a_resumed_training_keeps_the_part_points_that_it_began_with(
     tiny_capture: Path, whole_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -490,7 +548,7 @@ def test_a_run_of_another_seed_is_not_continued(tiny_capture: Path, tmp_path: Pa
     train(options)
     with pytest.raises(CheckpointError, match="was begun with seed 0, now it is 1"):
         train(replace(options, seed=options.seed + 1))
-    with pytest.raises(ValueError, match="--steps 0"):
+    with pytest.raises(ValueError, match="`steps`: found 0, expected 1 to 100000000"):
         train(replace(options, steps=0))
 
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from told import Told
 from torch import Tensor
 
 from handavatar.avatar import CheckpointError
@@ -48,9 +49,9 @@ def _options(out: Path) -> PriorOptions:
 
 
 def test_training_repeats_with_its_seed_and_writes_what_it_returns(tmp_path: Path) -> None:
-    reported: list[int] = []
+    told = Told()
     fields = [
-        train_prior(options, lambda step, figures: reported.append(step))
+        train_prior(options, told.progress)
         for options in (
             _options(tmp_path / "a"),
             _options(tmp_path / "b"),
@@ -60,7 +61,7 @@ def test_training_repeats_with_its_seed_and_writes_what_it_returns(tmp_path: Pat
     states = [field.state_dict() for field in fields]
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
     assert not all(torch.equal(states[0][name], states[2][name]) for name in states[0])
-    assert reported == [4, 4, 4]
+    assert told.steps == [0, 1, 2, 3, 4] * 3
     loaded = PairOccupancy()
     load_prior(loaded, tmp_path / "a")
     assert all(torch.equal(value, states[0][name]) for name, value in loaded.state_dict().items())
@@ -136,18 +137,18 @@ def test_a_prior_that_diverges_says_how_to_go_on(
         monkeypatch.setattr(torch.optim.Adam, "step", step)
 
     diverging(1, False)
-    with pytest.raises(NotFinite, match=r"step 1: .* holds inf(.|\n)*again with --seed 1$"):
+    with pytest.raises(NotFinite, match=r"step 1: .* holds inf(.|\n)*again with `seed=1`$"):
         train_prior(options)
     assert not (tmp_path / "a").exists()
     # In the last step, and in the optimiser alone.
     diverging(4, True)
     with pytest.raises(NotFinite, match=r"step 4: adam\.\d+\.exp_avg_sq holds inf") as caught:
         train_prior(options)
-    assert f"--start-from {tmp_path / 'a'} --seed 1" in str(caught.value)
+    assert f"`start_from='{tmp_path / 'a'}'` `seed=1`" in str(caught.value)
     diverging(3, False)
     with pytest.raises(NotFinite, match=r"step 3(.|\n)*checkpoint of step 2 is good") as caught:
         train_prior(with_folder)
-    assert f"--folder {tmp_path / 'run'} --seed 1" in str(caught.value)
+    assert f"`folder='{tmp_path / 'run'}'` `seed=1`" in str(caught.value)
     monkeypatch.setattr(torch.optim.Adam, "step", advance)
     for again in (
         replace(options, start_from=tmp_path / "a", seed=1),
@@ -237,7 +238,7 @@ def test_at_joints_both_parts_are_asked_and_not_the_deciding_one_alone() -> None
 
 def test_points_at_joints_are_for_pairs_alone(tmp_path: Path) -> None:
     options = replace(_options(tmp_path / "a"), decoder="coap", joint_points=10)
-    with pytest.raises(ValueError, match="10 points at joints for the decoder 'coap'"):
+    with pytest.raises(ValueError, match="`joint_points`: found 10 for the decoder 'coap'"):
         train_prior(options)
     assert not list(tmp_path.iterdir())
 

@@ -21,7 +21,9 @@ def wave() -> Motion:
     return Motion(10.0, rotations, torch.zeros(5, 3))
 
 
-def live_server(avatar: HandAvatar, out: Path) -> AbstractContextManager[ViewServer]:
-    """On loopback, without a token, with the motion ``wave``; saves avatars in ``out``."""
+def live_server(
+    avatar: HandAvatar, out: Path, token: str = ""
+) -> AbstractContextManager[ViewServer]:
+    """On loopback, with the motion ``wave``; saves avatars in ``out``."""
     studio = Studio(avatar, {"wave": wave()}, FEW)
-    return serving(ViewServer(studio, guard_of("127.0.0.1", ""), 0, out))
+    return serving(ViewServer(studio, guard_of("127.0.0.1", token), 0, out))

@@ -131,7 +131,7 @@ def test_a_token_on_loopback_is_asked_for_too() -> None:
 
 @pytest.mark.parametrize("token", ["a b", "x\r\nSet-Cookie: y", "ü", "a" * 201, "a;b"])
 def test_tokens_that_no_address_carries_are_errors(token: str) -> None:
-    with pytest.raises(ValueError, match="--token"):
+    with pytest.raises(ValueError, match="`token`"):
         guard_of("127.0.0.1", token)
 
 

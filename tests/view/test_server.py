@@ -1,5 +1,6 @@
 """The server as a stranger meets it: over its socket."""
 
+import contextlib
 import http.client
 import io
 import json
@@ -25,8 +26,9 @@ from PIL import Image
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.motion import write_motion
-from handavatar.view.connections import MOST_BYTES, MOST_CONNECTIONS
+from handavatar.view.connections import MOST_BYTES
 from handavatar.view.guard import guard_of
+from handavatar.view.limits import Connections
 from handavatar.view.server import ViewServer, serving
 from handavatar.view.studio import Studio
 
@@ -302,23 +304,57 @@ def test_fifty_clients_at_once_each_see_their_own(server: ViewServer) -> None:
     assert_alive(server)
 
 
-def test_more_connections_than_may_be_are_cut_off_and_places_come_free(
-    server: ViewServer,
+def test_two_hundred_idle_and_dripping_connections_harm_nobody(
+    server: ViewServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    idle = [
-        socket.create_connection(("127.0.0.1", server.port), timeout=5)
-        for _ in range(MOST_CONNECTIONS + 20)
-    ]
-    time.sleep(0.3)
+    idle = [socket.create_connection(("127.0.0.1", server.port), timeout=5) for _ in range(200)]
+    for number, connection in enumerate(idle):
+        with contextlib.suppress(OSError):  # of those that had to make room already
+            connection.sendall(b"GET / HTTP/1.1\r\n"[: number % 16])
+    for _ in range(3):
+        assert_alive(server)
+    connections = server._http.connections
+    assert len(connections._waiting) <= connections.limits.waiting
+    # As if the time for a head had passed, in which a byte came now and then.
+    later = Connections(connections.limits, lambda: time.monotonic() + 11)
+    monkeypatch.setattr(connections, "_clock", later._clock)
+    until(lambda: not connections._waiting)
+    monkeypatch.undo()
+    assert_alive(server)
     for connection in idle:
+        with contextlib.suppress(ConnectionError):
+            assert connection.recv(1) == b"", "the server has hung up"
         connection.close()
-    for _ in range(100):
-        try:
-            assert_alive(server)
-            return
-        except OSError:
-            time.sleep(0.1)
-    pytest.fail("no place came free")
+
+
+def test_a_body_that_drips_is_cut_off(server: ViewServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    head = f"POST /picture HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n".encode()
+    head += b"Content-Type: application/json\r\nContent-Length: 50\r\n\r\n{"
+    connections = server._http.connections
+    with socket.create_connection(("127.0.0.1", server.port), timeout=PATIENCE) as connection:
+        connection.sendall(head)
+        until(lambda: bool(connections._served))
+        monkeypatch.setattr(connections, "_clock", lambda: time.monotonic() + 22)
+        assert connection.recv(1) == b""
+        until(lambda: not connections._served)
+    monkeypatch.undo()
+    assert_alive(server)
+
+
+def test_places_are_for_those_who_were_let_in(small_avatar: HandAvatar, tmp_path: Path) -> None:
+    """Strangers without the token take none, however many there are."""
+    with live_server(small_avatar, tmp_path, token="secret") as closed:
+        connections = closed._http.connections
+        taken = []
+        real = connections.place
+
+        def noted(connection: socket.socket) -> Any:
+            taken.append(connection)
+            return real(connection)
+
+        connections.place = noted  # type: ignore[method-assign]
+        assert ask(closed, "/page.js")[0] == 401 and not taken
+        assert ask(closed, "/page.js?token=secret")[0] == 200 and len(taken) == 1
 
 
 def test_a_tab_closed_in_mid_frame_ends_its_picture(server: ViewServer) -> None:

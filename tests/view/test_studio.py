@@ -370,5 +370,5 @@ def test_a_page_chooses_among_lights_and_each_has_its_own_view(
     saved = HandAvatar.load(of_two.save(Touches(light=1), tmp_path))
     assert saved.edit == Edit(light=1)
     assert Studio(saved, settings=FEW).about()["touches"]["light"] == 1
-    with pytest.raises(SceneError, match=r"light 5: .* choose from 0, 1"):
+    with pytest.raises(SceneError, match=r"`light`: .* of number 5; choose from 0, 1"):
         of_two.shot(Scene(touches=Touches(light=5)))

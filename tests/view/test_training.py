@@ -27,9 +27,9 @@ from PIL import Image
 from handavatar import cli
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame, read_capture
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.train import live
 from handavatar.train.live import live_folder, shown_live
-from handavatar.train.progress import Progress
 from handavatar.train.runs import Run, append_log, create_run, truncate_log
 from handavatar.view import server as view_server
 from handavatar.view.beside import PageOptions, page_beside
@@ -51,13 +51,14 @@ class Trainer:
     run: Run
     avatar: HandAvatar
     frames: list[Frame]
+    border: Progress
     progress: Progress
     watch: Watch
 
     def step(self, number: int, **figures: float) -> None:
         """A step is done, and the onlooker looks."""
         append_log(self.run, number, figures)
-        self.progress.update(number, **figures)
+        self.progress(number, 100, **figures)
         self.look()
 
     def look(self) -> None:
@@ -87,9 +88,9 @@ def trainer(
     avatar.load_state_dict(small_avatar.state_dict())
     frames = [capture.frame(index) for index in capture.split("train")]
     with ExitStack() as stack:
-        stack.enter_context(shown_live(run, avatar, None, frames))
-        progress = stack.enter_context(Progress("train", 100))
-        yield Trainer(run, avatar, frames, progress, Watch(run.folder, FEW))
+        heard = stack.enter_context(shown_live(run, avatar, None, frames, SILENT))
+        border, progress = heard.stages({"border": 10.0, "train": 90.0}).values()
+        yield Trainer(run, avatar, frames, border, progress, Watch(run.folder, FEW))
 
 
 def ask(port: int, path: str, content: Any = None, **headers: str) -> tuple[int, bytes]:
@@ -134,7 +135,7 @@ def test_the_avatar_is_left_anew_only_while_a_page_asks(
     assert trainer.watch.about()["avatar"] != before
     monkeypatch.setattr(live, "_PATIENCE", 0.0)
     before = trainer.watch.about()["avatar"]
-    trainer.progress.update(4)
+    trainer.progress(4, 100)
     assert trainer.watch.about()["avatar"] == before
 
 
@@ -227,10 +228,9 @@ def test_what_there_is_not_is_refused(trainer: Trainer) -> None:
 
 
 def test_losses_are_those_of_the_log_and_of_what_was_told(trainer: Trainer) -> None:
-    with Progress("border", 5) as border:
-        for step in range(1, 6):
-            border.update(step, loss=1 / step)
-            trainer.look()
+    for step in range(1, 6):
+        trainer.border(step, 5, loss=1 / step)
+        trainer.look()
     for step in range(1, 6):
         trainer.step(step, loss=2.0 / step, color=1.0)
     jobs = trainer.watch.curves()["jobs"]

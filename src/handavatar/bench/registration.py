@@ -62,6 +62,7 @@ from handavatar.capture.video import (
     capture_video,
     track_video,
 )
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.geometry.cameras import Camera
@@ -69,6 +70,7 @@ from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
 from handavatar.jobs.files import write_atomically
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.synthetic.films import FILMS, make_film
 from handavatar.synthetic.truth import FilmTruth, read_film_truth
 from handavatar.train.kept import capture_fingerprint, origin, origin_notes, read_kept
@@ -106,6 +108,7 @@ class RegistrationTableOptions:
 
     def __post_init__(self) -> None:
         """Refuses cases and rows that there are not."""
+        require_ranges(self, seeds=SEEDS)
         for case in self.cases:
             if case != "video" and not _NOISE_CASE.fullmatch(case):
                 raise CaptureError(
@@ -144,18 +147,18 @@ class RegistrationTable(ResultTable):
 
 
 def registration_table(
-    options: RegistrationTableOptions, report: Callable[[int], None] | None = None
+    options: RegistrationTableOptions, progress: Progress = SILENT
 ) -> RegistrationTable:
     """Spoils, tracks, fits, registers and judges.
 
     Args:
         options: what.
-        report: told the number of clips and rows done.
+        progress: told the number of clips and rows done.
 
     Raises:
         CaptureError: a capture or film that cannot be used, or mediapipe is missing.
     """
-    finished = step_counter(report)
+    finished = step_counter(progress, options.total_steps)
     cases: dict[str, dict[str, Figures]] = {}
     results = _Results(options.keep, options.any_commit)
     for case in options.cases:

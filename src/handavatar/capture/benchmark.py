@@ -6,7 +6,6 @@ the first one's capture with poses that are off by five degrees. Everything foll
 and the size: subjects, skins, motions, noise.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -16,6 +15,7 @@ from handavatar.capture.degraded import DegradeOptions, degrade_capture
 from handavatar.capture.pathtracer import LIGHTINGS
 from handavatar.capture.synthetic import SynthOptions, make_capture
 from handavatar.jobs.files import FolderKind, make_folder
+from handavatar.jobs.progress import SILENT, Progress
 
 BENCHMARK = FolderKind("benchmark")
 """A folder of captures, each in a folder of its name."""
@@ -105,7 +105,7 @@ def synth_options(name: str, size: Literal["mini", "standard"]) -> SynthOptions:
 def make_benchmark(
     folder: Path,
     options: BenchmarkOptions,
-    on_progress: Callable[[int, str], None] = lambda done, name: None,
+    progress: Progress = SILENT,
 ) -> list[Path]:
     """Makes the captures that are not there yet, each in a folder of its name.
 
@@ -114,7 +114,7 @@ def make_benchmark(
     Args:
         folder: where they are to be.
         options: size and names.
-        on_progress: called with the captures done and the name of the last.
+        progress: told how far it is, and the name of each capture.
 
     Raises:
         CaptureError: for an unknown name, or if Mitsuba is missing.
@@ -122,17 +122,20 @@ def make_benchmark(
     make_folder(folder, BENCHMARK)
     make_folder(folder / options.size, BENCHMARK)
     folders = []
-    for done, name in enumerate(options.names(), start=1):
+    parts = progress.stages({name: 1.0 for name in options.names()})
+    for name in options.names():
         target = folder / options.size / name
-        if not target.exists():
+        if target.exists():
+            parts[name].skip()
+        else:
             source = _source(name)
             if source == name:
-                make_capture(target, synth_options(name, options.size))
+                make_capture(target, synth_options(name, options.size), progress=parts[name])
             else:
                 worse = DEGRADATIONS[name.rpartition("-")[2]]
                 seed = SUBJECTS[name.split("-")[0]][0]
                 how = replace(worse, source=folder / options.size / source, seed=seed)
-                degrade_capture(target, how)
+                degrade_capture(target, how, progress=parts[name])
         folders.append(target)
-        on_progress(done, name)
+        parts[name](1.0)
     return folders

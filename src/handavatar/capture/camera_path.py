@@ -43,7 +43,7 @@ def metres_of_unit(
             "how long the unit of the cameras' positions is cannot be told: the hand moved about "
             f"as much as the camera did (of its way {max(0, round(100 * explained))} % is the "
             "camera's)",
-            "hold the hand still while the camera moves, or name the unit with --camera-unit "
+            "hold the hand still while the camera moves, or name the unit with `camera_unit` "
             "(metres; 1 where the positions are in metres)",
         )
     return unit

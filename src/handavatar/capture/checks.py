@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from handavatar.errors import HandAvatarError
+
 MAX_JSON_BYTES = 64 * 2**20
 MAX_JSON_CONTAINERS = 4_000_000
 """Lists and objects: each takes 60 bytes and more, of three in the file. A motion of 100,000 steps
@@ -39,19 +41,17 @@ _ORIENTATION = 0x0112
 """Tag of EXIF; 1 is upright, and so is 0, which some programs write for not knowing."""
 
 
-class CaptureError(ValueError):
-    """A capture or motion that cannot be used: what was found, where, and what to do.
-
-    Attributes:
-        what: what was found and what was expected.
-        remedy: what to do about it.
-    """
+class CaptureError(HandAvatarError):
+    """A capture or motion that cannot be used: what was found, where, and what to do."""
 
     def __init__(self, what: str, remedy: str = "") -> None:
-        """Keeps the two halves apart, so that a list of problems can be printed as a table."""
-        super().__init__(f"{what}\n{remedy}" if remedy else what)
-        self.what = what
-        self.remedy = remedy
+        """Keeps the two halves apart, so that a list of problems can be printed as a table.
+
+        Args:
+            what: was found, and what was expected.
+            remedy: what to do about it.
+        """
+        super().__init__(what, "", remedy)
 
 
 def load_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:

@@ -53,13 +53,13 @@ from handavatar.hand.landmarks import NUM_LANDMARKS
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.signals import heed, heeds, stop_point
 from handavatar.jobs.threads import one_thread
 from handavatar.tracker.model import shipped_tracker
 
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
-Progress = Callable[[float, str], None]
-"""Told the share of the work that is done, in [0, 1], and what is being done."""
 _WRIST_MARGIN = 0.008
 """Metres before the rig's end from where on masks are believed."""
 _PAUSE = 1.0
@@ -165,7 +165,7 @@ def lay_hand(
     rig: Rig,
     fit: FitOptions,
     register: RegisterOptions,
-    report: Progress,
+    progress: Progress,
 ) -> list[LaidClip]:
     """Lays one hand onto all recordings: landmarks first, then masks, then masks and texture.
 
@@ -174,16 +174,23 @@ def lay_hand(
         rig: to lay onto them.
         fit: how it is first fitted, to landmarks alone.
         register: how it is laid onto masks and texture.
-        report: told the share of all of a capture's work that is done.
+        progress: told how far it is.
 
     Raises:
         CaptureError: colours or the cameras' unit cannot be told from these pictures.
     """
-    masks = [
-        _found_masks(clip, part)
-        for clip, part in zip(clips, _parts(report, 0.4, 0.5, clips), strict=True)
-    ]
-    report(0.5, "fitting the hand")
+    stages = progress.stages(
+        {
+            "cutting out the hand": 10.0,
+            "fitting the hand": 5.0,
+            "laying the hand onto the masks": 15.0,
+            "cutting out the hand again": 5.0,
+            "laying the hand onto masks and texture": 15.0,
+        }
+    )
+    parts = stages["cutting out the hand"].equal_parts(len(clips))
+    masks = [_found_masks(clip, part) for clip, part in zip(clips, parts, strict=True)]
+    stages["fitting the hand"](0.0)
     fitted = _fitted_to_landmarks(clips, rig, fit)
     clips = [_with_unit(clip, hands) for clip, hands in zip(clips, fitted, strict=True)]
     known = [_known_before_wrist(*pair, rig) for pair in zip(clips, fitted, strict=True)]
@@ -194,11 +201,12 @@ def lay_hand(
         known,
         rig,
         replace(register, texture_sigmas=()),
-        lambda share: report(0.55 + 0.15 * share, "laying the hand onto the masks"),
+        stages["laying the hand onto the masks"],
     )
+    parts = stages["cutting out the hand again"].equal_parts(len(clips))
     guided = [
         _guided_masks(clip, hands, rig, part)
-        for clip, hands, part in zip(clips, fitted, _parts(report, 0.7, 0.75, clips), strict=True)
+        for clip, hands, part in zip(clips, fitted, parts, strict=True)
     ]
     before = [_known_before_wrist(*pair, rig) for pair in zip(clips, fitted, strict=True)]
     fitted = _registered(
@@ -211,7 +219,7 @@ def lay_hand(
         ],
         rig,
         replace(register, is_wide=False, tilts=(), restarts=0),
-        lambda share: report(0.75 + 0.15 * share, "laying the hand onto masks and texture"),
+        stages["laying the hand onto masks and texture"],
     )
     return [
         LaidClip(clip, hands, _in_world(hands.fit, clip, rig), masks)
@@ -219,38 +227,28 @@ def lay_hand(
     ]
 
 
-def _parts(report: Progress, first: float, last: float, clips: Sequence[Clip]) -> list[Progress]:
-    """For each recording's share of a stretch of the work, in [0, 1]."""
-
-    def part(number: int) -> Progress:
-        return lambda share, doing: report(
-            first + (last - first) * (number + share) / len(clips), doing
-        )
-
-    return [part(number) for number in range(len(clips))]
-
-
-def _found_masks(clip: Clip, report: Progress) -> list[HandMask]:
+def _found_masks(clip: Clip, progress: Progress) -> list[HandMask]:
     if clip.masks is not None:
         return clip.masks
     hands = clip.track.hands
-    report(0.0, "learning the colour of the skin")
+    progress(0.0, 1.0, "learning the colour of the skin")
     colors = learn_colors(hands)
     return on_all_cores(
         lambda hand: find_mask(hand, colors),
         hands,
-        lambda share: report(share, "cutting out the hand"),
+        progress,
     )
 
 
 @one_thread()
-def _guided_masks(clip: Clip, fitted: FittedHands, rig: Rig, report: Progress) -> list[GuidedMask]:
-    report(0.0, "learning the colours again")
+def _guided_masks(
+    clip: Clip, fitted: FittedHands, rig: Rig, progress: Progress
+) -> list[GuidedMask]:
+    progress(0.0, 1.0, "learning the colours again")
     hands, gains = clip.track.hands, clip.gains
     meshes = on_all_cores(
         lambda number: placed_mesh(rig, fitted.vertices[number], fitted.fit.focal, hands[number]),
         range(len(hands)),
-        lambda share: None,
     )
     given = clip.masks
     if given is not None:
@@ -259,22 +257,35 @@ def _guided_masks(clip: Clip, fitted: FittedHands, rig: Rig, report: Progress) -
     return on_all_cores(
         lambda number: find_guided_mask(hands[number], meshes[number], colors, gains[number]),
         range(len(hands)),
-        lambda share: report(share, "cutting out the hand again"),
+        progress,
     )
 
 
 def on_all_cores(
-    work: Callable[[Piece], Result], pieces: Sequence[Piece], report: Callable[[float], None]
+    work: Callable[[Piece], Result], pieces: Sequence[Piece], progress: Progress = SILENT
 ) -> list[Result]:
-    """The work on every piece, in order; told is the share of the pieces that is done."""
+    """The work on every piece, in order; each begins at a stop point.
+
+    Args:
+        work: on one piece.
+        pieces: of the work.
+        progress: told how many pieces are done.
+    """
+    does_heed = heeds()
+
+    def on_piece(piece: Piece) -> Result:
+        heed(does_heed)
+        stop_point()
+        return work(piece)
+
     results: list[Result] = []
     # Torch's number of threads belongs to a thread.
     with ThreadPoolExecutor(
         os.cpu_count(), initializer=torch.set_num_threads, initargs=(1,)
     ) as pool:
-        for result in pool.map(work, pieces):
+        for result in pool.map(on_piece, pieces):
             results.append(result)
-            report(len(results) / len(pieces))
+            progress(len(results), len(pieces))
     return results
 
 
@@ -336,7 +347,7 @@ def see_skin(track: Track, rig: Rig) -> Track:
             )
         return replace(hand, points=seen.first(count))
 
-    hands = on_all_cores(seen_hand, track.hands, lambda share: None)
+    hands = on_all_cores(seen_hand, track.hands)
     return replace(track, hands=tuple(hands))
 
 
@@ -378,7 +389,7 @@ def _with_unit(clip: Clip, fitted: FittedHands) -> Clip:
     unit = metres_of_unit(clip.camera_from_world, fitted.vertices.mean(1))
     note = (
         f"the unit of the cameras' positions was taken as {unit:.4g} m: so the hand moves least "
-        "(--camera-unit says otherwise)"
+        "(`camera_unit` says otherwise)"
     )
     track = replace(clip.track, notes=(*clip.track.notes, note))
     return replace(clip, track=track, unit=unit)
@@ -391,7 +402,7 @@ def _registered(
     known: Sequence[Sequence[Bool[np.ndarray, "_ _"]]],
     rig: Rig,
     options: RegisterOptions,
-    report: Callable[[float], None],
+    progress: Progress,
 ) -> list[FittedHands]:
     """The hand laid onto landmarks, masks and texture: the one place that knows how."""
     observations, fits = [], []
@@ -412,7 +423,7 @@ def _registered(
         rotations=torch.cat([fit.rotations for fit in fits]),
         translation=torch.cat([fit.translation for fit in fits]),
     )
-    fit, registered = register_hands(rig, whole, observations, options, report)
+    fit, registered = register_hands(rig, whole, observations, options, progress)
     covariances = torch.linalg.inv(registered.information.double()).float()
     vertices = posed_vertices(registered)
     wrist = rig.shaped(fit.shape_coefficients).rest_joints[0]

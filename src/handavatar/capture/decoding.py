@@ -20,6 +20,7 @@ from jaxtyping import UInt8
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.color_spaces import ColorTags, srgb_from_planes, srgb_from_rgb
+from handavatar.errors import ArgumentError, require_ranges
 
 # FFmpeg's names of mp4, mov, mkv, webm and others that cameras write. Nothing else is opened:
 # playlists and image patterns name other files or network addresses.
@@ -83,15 +84,12 @@ class Sampling:
 
     def __post_init__(self) -> None:
         """Refuses what selects nothing."""
-        if not (math.isfinite(self.fps) and self.fps > 0):
-            raise ValueError(f"--fps {self.fps:g}: expected pictures per second, more than 0")
-        if self.max_frames < 1:
-            raise ValueError(f"--max-frames {self.max_frames}: expected at least 1")
-        if not (math.isfinite(self.start) and self.start >= 0):
-            raise ValueError(f"--start {self.start:g}: expected seconds from the first picture")
+        require_ranges(
+            self, fps=(0.001, 1000), max_frames=(1, 1_000_000), start=(0, 1e6), end=(0, 1e7)
+        )
         if self.end is not None and not self.end > self.start:
-            raise ValueError(
-                f"--end {self.end:g}: expected more than --start {self.start:g}, in seconds"
+            raise ArgumentError(
+                "end", f"{self.end:g}", f"more than `start={self.start:g}`, in seconds"
             )
 
     def wanted(self, number: int) -> float:
@@ -353,7 +351,7 @@ class _Decoder:
                 if left > 0 and not self.sampling.is_over(time + 1 / self.sampling.fps):
                     self.say(
                         f"{number} pictures were taken, up to {time:.1f} s; the {left:.1f} s after "
-                        "that were not looked at (--max-frames, --start and --end choose others)"
+                        "that were not looked at (`max_frames`, `start` and `end` choose others)"
                     )
                 break
         if self.scan.num_sizes > 1:
@@ -392,7 +390,7 @@ class _Decoder:
                 yield before
         if before is not None and taken < 0 and before[1] < self.sampling.start:
             raise CaptureError(
-                f"{self.path}: --start {self.sampling.start:g} lies behind its end at "
+                f"{self.path}: `start={self.sampling.start:g}` lies behind its end at "
                 f"{before[1]:.1f} seconds",
                 "choose an earlier one",
             )
@@ -485,7 +483,7 @@ class _Decoder:
         if display.is_mirrored:
             self.say(
                 "the file says that its pictures are shown mirrored, and so they are read "
-                "(--side overrules which hand it is)"
+                "(`side` overrules which hand it is)"
             )
         if abs(stretch - 1) > 0.01:
             self.say(f"pixels are {stretch:.3g} times as wide as high: pictures are resampled")

@@ -15,11 +15,12 @@ import torch
 from PIL import Image, ImageFilter
 from scipy.ndimage import binary_erosion
 
-from handavatar.capture.checks import CaptureError
 from handavatar.capture.frames import Capture, CaptureWriter, Frame, read_capture
 from handavatar.capture.motion import Motion, write_motion
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
+from handavatar.jobs.progress import SILENT, Progress
 
 _TRACKED = 0.5
 """Confidence of poses that are no longer exact."""
@@ -54,28 +55,30 @@ class DegradeOptions:
 
     def __post_init__(self) -> None:
         """Refuses what would make a capture better, or nothing of it."""
-        limits = {
-            "pose_noise": (0, 45),
-            "pose_noise_correlation": (0, 3600),
-            "mask_erosion": (0, 64),
-            "blur": (0, 32),
-            "jpeg": (1, 100),
-        }
-        for name, (least, most) in limits.items():
-            if not least <= getattr(self, name) <= most:
-                raise CaptureError(
-                    f"{name} is {getattr(self, name)}, expected {least} to {most}",
-                    "choose a value between",
-                )
+        require_ranges(
+            self,
+            pose_noise=(0, 45),
+            pose_noise_correlation=(0, 3600),
+            mask_erosion=(0, 64),
+            blur=(0, 32),
+            jpeg=(1, 100),
+            seed=SEEDS,
+        )
 
 
-def degrade_capture(folder: Path, options: DegradeOptions, overwrite: bool = False) -> Capture:
+def degrade_capture(
+    folder: Path,
+    options: DegradeOptions,
+    overwrite: bool = False,
+    progress: Progress = SILENT,
+) -> Capture:
     """Writes a worse copy of a capture.
 
     Args:
         folder: where the copy is to be.
         options: the source, and what happens to it.
         overwrite: replace a capture that is there.
+        progress: told the frames done.
 
     Raises:
         CaptureError: if the source is damaged or the folder is in use.
@@ -98,6 +101,7 @@ def degrade_capture(folder: Path, options: DegradeOptions, overwrite: bool = Fal
         noise = _PoseNoise(options, random)
         for index in range(len(source.records)):
             writer.add(_degraded(source.frame(index), options, noise))
+            progress(index + 1, len(source.records))
         if (source.folder / "truth").is_dir():
             shutil.copytree(
                 source.folder / "truth", writer.file("truth/poses.json").parent, dirs_exist_ok=True

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from handavatar.capture.fitted_hand import HandFit, HandModel, projected
 from handavatar.capture.skin_points import SeenPoints
+from handavatar.errors import require_ranges
 from handavatar.geometry.rotations import axis_angle_from_matrix
 from handavatar.hand.landmarks import HAND_SIZE
 from handavatar.hand.pose import FINGER_BONES
@@ -58,6 +59,20 @@ class FitOptions:
     """Steps of the second stage."""
     retry_steps: int = 90
     """Steps of every further attempt at a frame that fits badly."""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            focal_share=(0.05, 50),
+            focal_tolerance=(0, 10),
+            landmark_error=(1e-6, 1),
+            outline_error=(1e-6, 1),
+            acceleration=(1e-3, 1e6),
+            landmark_steps=(0, 10**5),
+            outline_steps=(0, 10**5),
+            retry_steps=(0, 10**5),
+        )
 
 
 @dataclass(frozen=True, eq=False)

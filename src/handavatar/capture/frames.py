@@ -12,11 +12,9 @@ A left hand is stored mirrored to a right one (image, mask, camera and pose alik
 
 import json
 import math
-import os
 import re
-import shutil
-import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
@@ -29,7 +27,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from PIL import Image
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from handavatar.capture.checks import (
@@ -43,6 +41,7 @@ from handavatar.capture.checks import (
     path_inside,
     text_field,
 )
+from handavatar.errors import raise_if_refused
 from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.rotations import invert_rigid
@@ -51,11 +50,10 @@ from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.jobs.files import (
     FolderInUse,
     FolderKind,
-    mark_folder,
-    name_files,
+    fill_folder,
     refuse_folder_in_use,
     restore_folder,
-    swap_folder,
+    write_atomically,
 )
 from handavatar.jobs.finite import find_not_finite
 
@@ -413,6 +411,7 @@ class Capture:
             tensors = load_file(path)
             found = {name: tensors[name].float() for name in shapes}
         except (SafetensorError, KeyError, OSError) as error:
+            raise_if_refused(error)
             raise CaptureError(f"{file} cannot be read ({error})", _MAKE_AGAIN) from error
         for name, shape in shapes.items():
             values = found[name]
@@ -760,18 +759,15 @@ class CaptureWriter:
         self._covariances: list[Tensor | None] = []
         self._landmarks: list[LandmarkSightings | None] = []
         self._inputs = tuple(inputs)
-        try:
+        with _folder_errors():
             restore_folder(self.folder)
             refuse_folder_in_use(self.folder, CAPTURE, overwrite, self._inputs)
-        except FolderInUse as error:
-            raise CaptureError(error.found, error.remedy) from error
 
     def __enter__(self) -> "CaptureWriter":
-        """Makes the temporary folder."""
-        self.folder.parent.mkdir(parents=True, exist_ok=True)
-        self._aside = Path(
-            tempfile.mkdtemp(prefix=f".{self.folder.name}.", suffix=".part", dir=self.folder.parent)
-        )
+        """Makes the folder that takes the capture's place when it is whole."""
+        self._filling = fill_folder(self.folder, CAPTURE, self._overwrite, self._inputs)
+        with _folder_errors():
+            self._aside = self._filling.__enter__()
         return self
 
     def file(self, relative: str) -> Path:
@@ -838,11 +834,14 @@ class CaptureWriter:
         traceback: TracebackType | None,
     ) -> None:
         """Puts the whole capture in place, or removes what there is of it."""
-        try:
-            if kind is None:
+        if kind is None:
+            try:
                 self._finish()
-        finally:
-            shutil.rmtree(self._aside, ignore_errors=True)
+            except BaseException as failure:
+                self._filling.__exit__(type(failure), failure, failure.__traceback__)
+                raise
+        with _folder_errors():
+            self._filling.__exit__(kind, error, traceback)
 
     def _finish(self) -> None:
         content = {
@@ -856,26 +855,19 @@ class CaptureWriter:
             raise CaptureError("a camera or time is not finite", "drop the frame") from error
         covariances = self._of_all_frames(self._covariances, "a covariance")
         if covariances:
-            save_file({"covariance": _stacked(covariances)}, self._aside / COVARIANCES)
+            self._write_tensors(COVARIANCES, {"covariance": _stacked(covariances)})
         landmarks = self._of_all_frames(self._landmarks, "landmarks")
         if landmarks:
             tensors = {
                 name: _stacked([getattr(seen, name) for seen in landmarks])
                 for name in _landmark_shapes(len(landmarks[0].vertices))
             }
-            save_file(tensors, self._aside / LANDMARKS)
-        with open(self._aside / "transforms.json", "w", encoding="utf-8") as stream:
-            stream.write(text)
-            stream.flush()
-            os.fsync(stream.fileno())
+            self._write_tensors(LANDMARKS, tensors)
+        write_atomically({self.file("transforms.json"): text.encode()}, is_durable=False)
         read_capture(self._aside)
-        self._aside.chmod(0o755)
-        mark_folder(self._aside, CAPTURE)
-        name_files(self._aside)
-        try:
-            swap_folder(self._aside, self.folder, CAPTURE, self._overwrite, self._inputs)
-        except FolderInUse as error:
-            raise CaptureError(error.found, error.remedy) from error
+
+    def _write_tensors(self, name: str, tensors: dict[str, Tensor]) -> None:
+        write_atomically({self.file(name): save(tensors)}, is_durable=False)
 
     def _of_all_frames(self, values: list[Said | None], what: str) -> list[Said]:
         """What the frames say; either all of them say it or none."""
@@ -886,6 +878,15 @@ class CaptureWriter:
                 f"give all frames {what}, or none",
             )
         return found
+
+
+@contextmanager
+def _folder_errors() -> Iterator[None]:
+    """A place that cannot be written is an error of captures, too."""
+    try:
+        yield
+    except FolderInUse as error:
+        raise CaptureError(error.found, error.remedy) from error
 
 
 def _stacked(values: list[Tensor]) -> Tensor:

@@ -39,19 +39,19 @@ CAUSES: dict[str, tuple[str, str]] = {
     ),
     "side": (
         "the hand may have been taken for the other one",
-        "if the side is wrong, name it with --side left or --side right",
+        "if the side is wrong, name it with `side='left'` or `side='right'`",
     ),
     "small": ("the hand is too small", "come closer to the camera"),
     "dark": ("the pictures are too dark", "record in more light"),
-    NO_MASK: ("it has no mask", "give a mask for every picture (--masks)"),
-    NO_CAMERA: ("its camera is not known", "give the camera of every picture (--camera)"),
+    NO_MASK: ("it has no mask", "give a mask for every picture (`masks`)"),
+    NO_CAMERA: ("its camera is not known", "give the camera of every picture (`camera`)"),
     TWO_HANDS: (
         "there are two hands",
-        "choose one with --hand left, --hand right or --hand larger, or record one alone",
+        "choose one with `hand='left'`, `hand='right'` or `hand='larger'`, or record one alone",
     ),
     OTHER_HAND: (
         "it is the other hand",
-        "record one hand, or choose it with --side left or --side right",
+        "record one hand, or choose it with `side='left'` or `side='right'`",
     ),
     NO_HAND: ("no hand is seen", "record one bare hand, whole, larger than a sixth of the picture"),
 }

@@ -8,7 +8,6 @@ middle, so that whatever camera sees the start goes on seeing the hand.
 
 import json
 import math
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +32,7 @@ from handavatar.hand.pose_sampling import (
     rotations_from_angles,
 )
 from handavatar.hand.rig import Rig
+from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import find_not_finite
 
 SCHEMA = 1
@@ -227,13 +227,7 @@ def write_motion(path: Path, motion: Motion) -> None:
         "rotations": motion.rotations.double().tolist(),
         "translations": motion.translations.double().tolist(),
     }
-    text = json.dumps(content, allow_nan=False)
-    aside = path.with_name(f".{path.name}.part")
-    try:
-        aside.write_text(text, encoding="utf-8")
-        os.replace(aside, path)
-    finally:
-        aside.unlink(missing_ok=True)
+    write_atomically({path: json.dumps(content, allow_nan=False).encode()})
 
 
 def evenly_spaced(
@@ -258,7 +252,7 @@ def evenly_spaced(
     count = int(float(times[-1] - times[0]) * fps + 1e-6) + 1
     if count > MAX_STEPS:
         raise CaptureError(
-            f"{count} steps at {fps:g} a second; {MAX_STEPS} at most", "choose a smaller --fps"
+            f"{count} steps at {fps:g} a second; {MAX_STEPS} at most", "choose a smaller `fps`"
         )
     if len(times) == 1:
         return Motion(fps, axis_angle_from_matrix(rotations).float(), translations.float())

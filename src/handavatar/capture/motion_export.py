@@ -7,6 +7,7 @@ from typing import Literal
 from handavatar.capture.motion import Motion, read_motion
 from handavatar.capture.motion_files.soma import write_soma
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.files import refuse_file_in_use
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,8 @@ class MotionToOptions:
     """Which hand it becomes; motions of left avatars are stored mirrored and are mirrored back."""
     rig: str = "open-hand"
     """The hand that the motion is for: open-hand, an imported one (mano-right) or its file."""
+    overwrite: bool = False
+    """Replace a file at OUT."""
 
 
 def motion_to(options: MotionToOptions) -> Motion:
@@ -34,7 +37,9 @@ def motion_to(options: MotionToOptions) -> Motion:
 
     Raises:
         CaptureError: the source is no motion, or the name does not end with ``.npz``.
+        FolderInUse: there is a file at ``out`` already.
     """
+    refuse_file_in_use(options.out, options.overwrite)
     motion = read_motion(options.source)
     write_soma(options.out, motion, load_rig(options.rig), options.side)
     return motion

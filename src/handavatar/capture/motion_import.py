@@ -1,7 +1,6 @@
 """Motions from what was filmed, or from other programs' files, at equal steps of time."""
 
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -19,8 +18,11 @@ from handavatar.capture.motion_files.trackers import is_hawor
 from handavatar.capture.motion_values import MAX_STEPS
 from handavatar.capture.tracking import has_mediapipe
 from handavatar.capture.video import VideoOptions, capture_video
+from handavatar.errors import require_ranges
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.files import refuse_file_in_use
+from handavatar.jobs.progress import SILENT, Progress
 
 _MOST_FPS = 240.0
 
@@ -58,25 +60,33 @@ class MotionFromOptions:
     """Of a file's camera; opengl has y up and z backwards."""
     focal: float | None = None
     """True focal length in pixels of the pictures that HaMeR or WiLoR saw, for their depths."""
+    overwrite: bool = False
+    """Replace a file at OUT."""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, fps=(0.001, 1000), focal=(1, 1e6))
 
 
 def motion_from(
     options: MotionFromOptions,
     tell: Tell,
-    progress: Callable[[float, str], None] | None = None,
+    progress: Progress = SILENT,
 ) -> Motion:
     """The motion of a hand that was filmed, or that another program's file holds.
 
     Args:
         options: of what.
         tell: called with what a person should know.
-        progress: called with the share of a video's work that is done.
+        progress: told how far it is.
 
     Raises:
         CaptureError: there is no hand in it, the poses have no times, or a file is not what it is
             said to be.
+        FolderInUse: there is a file at ``out`` already.
         LicensedRigMissing: a file cannot be read without the user's own MANO file.
     """
+    refuse_file_in_use(options.out, options.overwrite)
     if (options.source / "transforms.json").is_file():
         return motion_of_capture(read_capture(options.source), options.fps, tell)
     is_told = options.layout != "auto"

@@ -96,11 +96,20 @@ class SurfaceMaps:
     normals: Float[Tensor, "height width 3"]
 
 
+_TRIAL = """
+import drjit, mitsuba
+mitsuba.set_variant("llvm_ad_rgb")
+drjit.eval(mitsuba.render(mitsuba.load_dict(mitsuba.cornell_box()), spp=1))
+drjit.sync_thread()
+"""
+
+
 @cache
 def choose_variant(wanted: Variant = "auto") -> str:
     """The fastest Mitsuba variant that works on this machine.
 
-    A missing or broken LLVM library can end the whole process, so it is tried in another one.
+    A missing or broken LLVM library can end the whole process, so it is tried in another one, by a
+    small picture: versions 15 and 16 add numbers, and abort where rays are traced.
 
     Raises:
         CaptureError: if Mitsuba is not installed.
@@ -108,9 +117,8 @@ def choose_variant(wanted: Variant = "auto") -> str:
     _mitsuba()
     if wanted != "auto":
         return wanted
-    trial = "import mitsuba as m, drjit as d; m.set_variant('llvm_ad_rgb'); d.eval(m.Float(1) + 1)"
     try:
-        done = subprocess.run([sys.executable, "-c", trial], capture_output=True, timeout=120)
+        done = subprocess.run([sys.executable, "-c", _TRIAL], capture_output=True, timeout=120)
     except (OSError, subprocess.TimeoutExpired):
         return "scalar_rgb"
     return "llvm_ad_rgb" if done.returncode == 0 else "scalar_rgb"

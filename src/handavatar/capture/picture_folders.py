@@ -62,7 +62,7 @@ def picture_frames(source: Path, sampling: Sampling, tell: Tell) -> Iterator[Vid
         CaptureError: there are no pictures, or one cannot be read.
     """
     files = picture_files(source, tell)
-    tell(f"pictures tell no times: they are taken as {sampling.fps:g} a second (--fps)")
+    tell(f"pictures tell no times: they are taken as {sampling.fps:g} a second (`fps`)")
     sizes = [_upright_size(file) for file in files]
     width, height = working_size(sizes)
     is_same = [have_same_shape(size, (width, height)) for size in sizes]
@@ -77,7 +77,7 @@ def picture_frames(source: Path, sampling: Sampling, tell: Tell) -> Iterator[Vid
         if taken == sampling.max_frames:
             tell(
                 f"{taken} pictures were taken; {len(files) - number} after them were not looked at "
-                "(--max-frames)"
+                "(`max_frames`)"
             )
             break
         yield VideoFrame(number, time, _read(file, (width, height)), file.name)

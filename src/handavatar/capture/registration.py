@@ -3,7 +3,7 @@
 First the landmarks alone say about where it is; then outlines, and at last the texture, join them.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +25,8 @@ from handavatar.fit.register import Registered, RegisterOptions, register
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.rig import Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.stage_states import NOT_KEPT, StageState
 
 DEPTH_ERROR = 0.025
 """Metres by which its depth is off: measured on made films."""
@@ -117,7 +119,7 @@ def register_hands(
     fit: HandFit,
     observations: list[Observation],
     options: RegisterOptions,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = SILENT,
 ) -> tuple[HandFit, Registered]:
     """Goes on from a fit with all that the frames say; the focal length stays as it is.
 
@@ -182,7 +184,8 @@ def register_frames(
     frames: Sequence[Frame],
     options: RegisterOptions,
     learns_shape: bool = True,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = SILENT,
+    kept: StageState = NOT_KEPT,
 ) -> Registered:
     """Lays hands onto frames, held by what the capture says of landmarks and its poses' errors.
 
@@ -195,8 +198,10 @@ def register_frames(
         options: expected errors, rounds.
         learns_shape: whether the hand's shape moves.
         progress: told how far it is.
+        kept: where it goes on, if it was interrupted.
 
     Raises:
+        Interrupted: if the command was told to stop.
         CaptureError: if the skin that a tracker saw is another rig's.
     """
     for frame in frames:
@@ -223,6 +228,7 @@ def register_frames(
         options,
         learns_shape=learns_shape,
         progress=progress,
+        kept=kept,
     )
 
 
@@ -235,7 +241,5 @@ def poses_of(found: Registered) -> list[HandPose]:
 def observe_frame(frame: Frame) -> Observation:
     """What a frame of a capture shows, its picture binned if it is large."""
     frame = frame.binned(FITTED_SIDE)
-    picture = FramePicture.of(
-        frame.camera, frame.image.float() / 255, frame.alpha, frame.known, frame.gain
-    )
+    picture = FramePicture.of(frame.camera, frame.image, frame.alpha, frame.known, frame.gain)
     return Observation(picture, frame.time, frame.landmarks)

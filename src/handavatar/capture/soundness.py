@@ -11,7 +11,7 @@ poses are off by 2, 5 and 10 degrees; fitted clips of real hands) and on bad one
 import math
 import statistics
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
@@ -47,6 +47,7 @@ from handavatar.capture.frames import (
 from handavatar.geometry.cameras import project
 from handavatar.hand.rig import RigError, ShapedHand
 from handavatar.hand.rigs import find_rig
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.threads import one_thread
 from handavatar.render.rasterize import covered_pixels
 
@@ -90,9 +91,7 @@ _MOVED = 2.0
 """Small pixels: a picture that lies less far beside its mask is not called shifted."""
 
 
-def find_problems(
-    folder: Path, progress: Callable[[int, int], None] | None = None
-) -> list[Problem]:
+def find_problems(folder: Path, progress: Progress = SILENT) -> list[Problem]:
     """Everything wrong with a capture folder, pixels included; empty if it is sound.
 
     Whether there is a hand, and whether it agrees with the pictures, is looked at only where all
@@ -114,11 +113,12 @@ def find_problems(
     return [*problems, *_problems_of_frames(capture, None if problems else hand, progress)]
 
 
-def require_sound(capture: Capture) -> None:
+def require_sound(capture: Capture, progress: Progress = SILENT) -> None:
     """Refuses a capture that nothing good can be learned from.
 
     Args:
         capture: as read.
+        progress: told how many frames have been read.
 
     Raises:
         CaptureError: the first problem with its frame, its cause and a remedy, and how many more.
@@ -129,7 +129,7 @@ def require_sound(capture: Capture) -> None:
     except CaptureError as error:
         what = f"{capture.folder / 'transforms.json'}: {error.what}"
         raise CaptureError(what, error.remedy) from error
-    problems = _problems_of_frames(capture, hand, None)
+    problems = _problems_of_frames(capture, hand, progress)
     if problems:
         rest = len(problems) - 1
         more = f"\nand {rest} more: handavatar capture check {capture.folder}" if rest else ""
@@ -207,7 +207,7 @@ class _Seen:
 def _problems_of_frames(
     capture: Capture,
     hand: ShapedHand | None,
-    progress: Callable[[int, int], None] | None,
+    progress: Progress,
 ) -> list[Problem]:
     """What is wrong with splits, pixels and, if there is a hand, its agreement with the frames."""
     problems = _problems_of_splits(capture)
@@ -232,8 +232,7 @@ def _problems_of_frames(
                 seen.append(
                     _Seen(record, small, fingerprint, float(overlap(small.mask, small.mesh)))
                 )
-            if progress is not None:
-                progress(index + 1, count)
+            progress(index + 1, count)
         if hand and seen:
             problems += _Comparison(hand, seen).problems()
     order = {record.name: index for index, record in enumerate(capture.records)}

@@ -22,7 +22,7 @@ The truth beside the frames lies in ``truth/`` in the same stored space as the p
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -31,12 +31,11 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from PIL import Image
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from handavatar.capture.frames import (
     Capture,
-    CaptureError,
     CaptureWriter,
     Frame,
     read_capture,
@@ -53,6 +52,7 @@ from handavatar.capture.pathtracer import (
     choose_variant,
 )
 from handavatar.capture.skin import SkinOptions, paint_skin, smooth_noise
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.geometry.cameras import Camera, look_at, project
 from handavatar.geometry.colors import eight_bits, srgb_from_linear
 from handavatar.geometry.meshes import uniform_laplacian, unique_edges, vertex_normals
@@ -66,6 +66,7 @@ from handavatar.hand.pose_sampling import (
 )
 from handavatar.hand.rig import Rig, ShapedHand
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.progress import SILENT, Progress
 
 TRAINING_GESTURES = (
     "relaxed",
@@ -137,14 +138,19 @@ class SynthOptions:
 
     def __post_init__(self) -> None:
         """Refuses what cannot be rendered."""
-        leasts = {"train_frames": 1, "test_frames": 1, "size": 8, "samples": 1, "test_views": 1}
-        for name, least in leasts.items():
-            if getattr(self, name) < least:
-                raise CaptureError(
-                    f"{name} is {getattr(self, name)}, expected at least {least}", f"raise {name}"
-                )
-        if not 0 <= self.tone <= 1:
-            raise CaptureError(f"tone is {self.tone:g}, expected 0 to 1", "choose a tone between")
+        require_ranges(
+            self,
+            train_frames=(1, 10**5),
+            test_frames=(1, 10**5),
+            size=(8, 4096),
+            samples=(1, 65_536),
+            seed=SEEDS,
+            tone=(0, 1),
+            personal=(0, 10),
+            subdivisions=(0, 4),
+            texture=(1, 8192),
+            test_views=(1, 1000),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +186,7 @@ def make_capture(
     folder: Path,
     options: SynthOptions,
     overwrite: bool = False,
-    on_progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = SILENT,
 ) -> Capture:
     """Renders a made capture into a folder.
 
@@ -188,7 +194,7 @@ def make_capture(
         folder: where the capture is to be.
         options: subject, motion and quality.
         overwrite: replace a capture that is there.
-        on_progress: called with frames done and frames in total.
+        progress: told the frames done.
 
     Raises:
         CaptureError: if Mitsuba is missing or the folder is in use.
@@ -223,7 +229,7 @@ def make_capture(
             writer.add(frame)
             _write_truth(writer, frame, traced, maps, options.geometry_truth)
             pictures.append(frame.image)
-            on_progress(done, total)
+            progress(done, total)
         noise = _noise(subject, motions["test"], options)
         _write_subject(writer, subject, options, noise)
         sheet = contact_sheet(pictures[:: max(1, total // 40)])
@@ -479,9 +485,8 @@ def _write_subject(
         "plain_vertices": subject.plain_vertices,
         "shape_coefficients": subject.shape_coefficients,
     }
-    save_file(
-        {k: v.contiguous() for k, v in arrays.items()}, writer.file("truth/subject.safetensors")
-    )
+    subject_file = writer.file("truth/subject.safetensors")
+    subject_file.write_bytes(save({k: v.contiguous() for k, v in arrays.items()}))
     facts = {
         "schema": 1,
         "options": asdict(options),

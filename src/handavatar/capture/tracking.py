@@ -6,7 +6,7 @@ by 35 degrees either way. Their median is steadier than any one of them, and whe
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -26,6 +26,7 @@ from handavatar.capture.windows import (
     resampled,
     window_around,
 )
+from handavatar.jobs.progress import SILENT, Progress
 
 LANDMARK_NAMES: tuple[str, ...] = (
     "wrist",
@@ -316,10 +317,13 @@ def mediapipe_finder() -> Iterator[HandFinder]:
         yield HandFinder(MediaPipeDetector(tracker), MediaPipeDetector(still))
 
 
+_USUAL_FRAMES = 60
+
+
 def track_hand(
     frames: Iterable[VideoFrame],
     side: str = "auto",
-    progress: Callable[[int, str], None] | None = None,
+    progress: Progress = SILENT,
     which: WhichHand = "only",
     finder: Finder | None = None,
 ) -> Track:
@@ -328,7 +332,7 @@ def track_hand(
     Args:
         frames: upright pictures in the order of time.
         side: ``left`` or ``right`` to overrule the tracker, which takes the video as not mirrored.
-        progress: called with the number of frames done and a word.
+        progress: told how far it is: nobody knows how many frames there are.
         which: of two hands.
         finder: of hands; MediaPipe's if None.
 
@@ -393,7 +397,7 @@ def _all_hands(
     finder: Finder,
     frames: Iterable[VideoFrame],
     both: bool,
-    progress: Callable[[int, str], None] | None,
+    progress: Progress,
 ) -> tuple[list[_LookedAt], list[Glance], tuple[int, int]]:
     """The hands of all pictures; where there are two, none unless both are asked for."""
     looked: list[_LookedAt] = []
@@ -420,8 +424,8 @@ def _all_hands(
         if hands:
             last = [seen.hand.landmarks for seen in hands]
         looked.append(_LookedAt(frame.index, hands, are_two))
-        if progress is not None:
-            progress(count + 1, "tracking")
+        # Each frame is a part of what is left.
+        progress((count + 1) / (count + 1 + _USUAL_FRAMES), 1.0, f"picture {count + 1}")
     return looked, glances, picture_size
 
 
@@ -564,7 +568,7 @@ def _check_found(track: Track) -> None:
     if num_double > _MAX_SHARE_OF_TWO_HANDS * total:
         raise UnusableTrackError(
             f"two hands in {num_double} of {total} pictures; expected one",
-            "choose one with --hand left, --hand right or --hand larger, or record one alone",
+            "choose one with `hand='left'`, `hand='right'` or `hand='larger'`, or record one alone",
             track,
         )
     if len(track.hands) < _MIN_FRAMES:
@@ -599,7 +603,7 @@ def _mediapipe_hands() -> Any:
     except ImportError as error:
         raise CaptureError(
             f"the hand tracker cannot be loaded ({error})",
-            "choose --tracker own, which needs no other package, or pip install "
+            "choose `tracker='own'`, which needs no other package, or pip install "
             "'handavatar[video]' (mediapipe 0.10.14: newer ones have no hand models)",
         ) from error
     return Hands

@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Literal
 
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.clip_gains import match_clips
 from handavatar.capture.clips import (
     Clip,
     LaidClip,
-    Progress,
     clip_of,
     lay_hand,
     on_all_cores,
@@ -50,12 +49,14 @@ from handavatar.capture.video_report import (
     too_few,
     with_common_gain,
 )
+from handavatar.errors import ArgumentError, require_ranges
 from handavatar.fit.energy import VIDEO_TEXTURE_SHARE, EnergyOptions
 from handavatar.fit.register import RegisterOptions
 from handavatar.geometry.rotations import mirror_rigid
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import files_named
+from handavatar.jobs.progress import SILENT, Progress
 
 TrackerChoice = Literal["auto", "own", "mediapipe", "both"]
 """Who finds hands and their landmarks in a video."""
@@ -122,6 +123,11 @@ class VideoOptions:
     )
     """How the hand is laid onto masks and texture."""
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, camera_unit=(1e-6, 1e6), size=(16, 4096), min_confidence=(0, 1))
+        self.sampling()  # Refuses what selects nothing.
+
     def sampling(self) -> Sampling:
         """Which pictures of the video are taken.
 
@@ -134,14 +140,12 @@ class VideoOptions:
         """One for every video, of itself alone.
 
         Raises:
-            ValueError: masks or cameras are given for some of the videos only.
+            ArgumentError: masks or cameras are given for some of the videos only.
         """
         files = (self.file, *self.more)
         for name, given in (("masks", self.masks), ("camera", self.camera)):
             if given and len(given) != len(files):
-                raise ValueError(
-                    f"--{name} names {len(given)}, expected one for each of {len(files)} videos"
-                )
+                raise ArgumentError(name, str(len(given)), f"one for each of {len(files)} videos")
         return [
             replace(
                 self,
@@ -167,7 +171,7 @@ class VideoOptions:
 def capture_video(
     options: VideoOptions,
     rig: Rig | None = None,
-    progress: Progress | None = None,
+    progress: Progress = SILENT,
     track: Track | None = None,
     open_finder: Callable[[], Finder] | None = None,
 ) -> Capture:
@@ -179,7 +183,7 @@ def capture_video(
     Args:
         options: which video, where to, how.
         rig: the hand to lay onto the pictures; the one that the options name if None.
-        progress: called now and then.
+        progress: told how far it is.
         track: what the tracker found in the one video already; it is tracked if None.
         open_finder: gives what finds the hand in a video, once for each; the tracker that the
             options name if None.
@@ -192,23 +196,21 @@ def capture_video(
         CaptureError: the video cannot be used, the folder is in use, or an extra is missing. If the
             pictures are the cause, a folder beside the would-be capture shows them.
     """
-    report = progress or (lambda share, doing: None)
-    options.sampling()  # Refuses what selects nothing, before any work.
+    stages = progress.stages(
+        {"finding the hand": 40.0, "laying the hand": 50.0, "cropping": 5.0, "writing": 5.0}
+    )
     videos = options.of_each_clip()
     if len(videos) > MAX_CLIPS:
-        raise ValueError(f"{len(videos)} videos, at most {MAX_CLIPS} of one hand")
+        raise ArgumentError("more", f"{len(videos)} videos", f"at most {MAX_CLIPS} of one hand")
     cameras = [read_camera(video.camera[0]) if video.camera else None for video in videos]
     rig = rig or load_rig(options.rig)
     header = _header(options, rig)
     CaptureWriter(options.out, **header)  # type: ignore[arg-type]  # refuses a folder in use now
     clips: list[Clip] = []
+    parts = stages["finding the hand"].equal_parts(len(videos))
     for number, (video, camera) in enumerate(zip(videos, cameras, strict=True)):
-
-        def finding(done: int, _: str, first: int = number) -> None:
-            report(0.4 * (first + done / (done + 60)) / len(videos), "finding the hand")
-
         try:
-            clips.append(_tracked_clip(video, rig, camera, finding, track, open_finder))
+            clips.append(_tracked_clip(video, rig, camera, parts[number], track, open_finder))
         except UnusableTrackError as error:
             unusable = TriedClip(video.file.name, error.track, number=number)
             raise failure(options.out, error.what, error.remedy, [unusable]) from error
@@ -219,15 +221,15 @@ def capture_video(
     ]
     try:
         _check_one_side(tried)
-        laid = lay_hand(clips, rig, options.fit, options.register, report)
+        laid = lay_hand(clips, rig, options.fit, options.register, stages["laying the hand"])
     except CaptureError as error:
         raise failure(options.out, error.what, error.remedy, tried) from error
-    results = _cropped(laid, rig, options, report)
+    results = _cropped(laid, rig, options, stages["cropping"])
     tried = [
         replace(clip, track=hands.clip.track, results=found, focal=hands.fitted.fit.focal)
         for clip, found, hands in zip(tried, results, laid, strict=True)
     ]
-    report(0.96, "writing")
+    stages["writing"](0.0)
     frames = kept_frames(tried)
     if len(frames) < MIN_KEPT:
         raise failure(options.out, *too_few(tried, len(frames)), tried)
@@ -243,14 +245,14 @@ def capture_video(
         shape_coefficients=shape,
         **header,  # type: ignore[arg-type]
     ) as writer:
-        for frame in frames:
+        for number, frame in enumerate(frames):
             writer.add(frame)
+            stages["writing"](number + 1, len(frames))
         save_json(writer.file("skipped.json"), skipped(tried))
         about = agreement(tried) | {"summary": summary(tried, frames, seen)}
         save_json(writer.file("fit.json"), about)
-        save_file({"counts": seen.counts.int()}, writer.file("seen.safetensors"))
+        writer.file("seen.safetensors").write_bytes(save({"counts": seen.counts.int()}))
         overview(tried, writer.file("overview.png"))
-    report(1.0, "done")
     return read_capture(options.out)
 
 
@@ -291,18 +293,20 @@ def _check_one_side(clips: Sequence[TriedClip]) -> None:
         sides = ", ".join(f"{clip.file}: {clip.track.side}" for clip in clips)
         raise CaptureError(
             f"the videos show two hands ({sides})",
-            "give videos of one hand, or name its side with --side",
+            "give videos of one hand, or name its side with `side`",
         )
 
 
 def _cropped(
-    laid: Sequence[LaidClip], rig: Rig, options: VideoOptions, report: Progress
+    laid: Sequence[LaidClip], rig: Rig, options: VideoOptions, progress: Progress
 ) -> list[list[FittedFrame]]:
     """All pictures of all recordings, of one size."""
     boxes = [
         [box_in_front(clip, number, rig) for number in range(len(clip.masks))] for clip in laid
     ]
     size = options.size or stored_size([box.side for of_clip in boxes for box in of_clip])
+
+    parts = progress.equal_parts(len(laid))
 
     def of_clip(number: int) -> list[FittedFrame]:
         clip = laid[number]
@@ -311,7 +315,7 @@ def _cropped(
                 clip, hand, boxes[number][hand], rig, size, options.min_confidence, number
             ),
             range(len(clip.masks)),
-            lambda share: report(0.9 + 0.05 * (number + share) / len(laid), "cropping"),
+            parts[number],
         )
 
     return [of_clip(number) for number in range(len(laid))]
@@ -319,21 +323,21 @@ def _cropped(
 
 def track_video(
     options: VideoOptions,
-    progress: Callable[[int, str], None] | None = None,
+    progress: Progress = SILENT,
     open_finder: Callable[[], Finder] | None = None,
 ) -> Track:
     """Finds the hand in the pictures of a video.
 
     Args:
         options: which video, pictures and hand.
-        progress: called with the number of pictures done and a word.
+        progress: told how far it is.
         open_finder: as for :func:`capture_video`.
 
     Raises:
         UnusableTrackError: there is no hand to go on with.
         CaptureError: the video cannot be read, or an extra is missing.
     """
-    return _tracked(options, None, progress or (lambda done, doing: None), open_finder).track
+    return _tracked(options, None, progress, open_finder).track
 
 
 @dataclass(eq=False)
@@ -348,11 +352,13 @@ class _Tracked:
 def _tracked(
     options: VideoOptions,
     camera: KnownCamera | None,
-    progress: Callable[[int, str], None],
+    progress: Progress,
     open_finder: Callable[[], Finder] | None,
 ) -> _Tracked:
     if options.hand == "both":
-        raise ValueError("--hand both makes two captures: ask for one of VideoOptions.of_each_hand")
+        raise ArgumentError(
+            "hand", "both makes two captures: ask for one of VideoOptions.of_each_hand"
+        )
     notes: list[str] = []
     is_own = open_finder is None and (
         options.tracker == "own" or (options.tracker == "auto" and not has_mediapipe())
@@ -389,7 +395,7 @@ def _tracked_clip(
     options: VideoOptions,
     rig: Rig,
     camera: KnownCamera | None,
-    progress: Callable[[int, str], None],
+    progress: Progress,
     track: Track | None,
     open_finder: Callable[[], Finder] | None,
 ) -> Clip:

@@ -17,7 +17,7 @@ from handavatar.capture.left_out import CAUSES, LeftOut
 from handavatar.capture.overview import Tile, contact_sheet, outlined
 from handavatar.capture.seen_skin import SeenSkin
 from handavatar.capture.tracking import DARK, NO_HAND, Track
-from handavatar.jobs.files import FolderKind, mark_folder
+from handavatar.jobs.files import FolderKind, mark_folder, write_atomically
 
 _HELD_OUT = ((0.28, 0.08), (0.68, 0.08))
 # Of the mesh: as much of it beyond the picture is contact with the border.
@@ -289,7 +289,7 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     sure = round(100 * summary["side_votes"])
     lines = [
         *(f"note: {note}" for note in summary.get("notes", [])),
-        f"hand: {summary['side']} ({sure} % of the tracker's votes; --side {other} overrules it)",
+        f"hand: {summary['side']} ({sure} % of the tracker's votes; `side={other!r}` overrules it)",
         f"frames: {summary['kept']} of {summary['pictures']} kept",
     ]
     for kind, count in summary["left_out"].items():
@@ -319,4 +319,4 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
 
 def save_json(path: Path, content: object) -> None:
     """Writes JSON that people may read."""
-    path.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
+    write_atomically({path: json.dumps(content, indent=1, allow_nan=False).encode()})

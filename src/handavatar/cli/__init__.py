@@ -5,6 +5,7 @@ options are a dataclass beside the code it serves; its summary here is its docst
 """
 
 import difflib
+import logging
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -12,9 +13,12 @@ from io import TextIOWrapper
 
 from handavatar import __version__
 from handavatar.cli import avatar, bench, capture, default, motion, prior, rig, tracker
-from handavatar.cli.failures import USAGE, report_failure
+from handavatar.cli.failures import USAGE, WarningsShown, report_failure
+from handavatar.jobs.progress import Progress, shown_progress
+from handavatar.jobs.signals import heard_signals
 
-Command = Callable[[list[str]], int]
+Command = Callable[[list[str], Progress], int]
+"""Of the words after the command's name, and the progress of the whole command."""
 
 COMMANDS: dict[str, Command] = {
     "demo": default.demo,
@@ -51,7 +55,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: words after the program's name; those of the process by default.
     """
-    words = list(sys.argv[1:] if arguments is None else arguments)
+    with heard_signals(ends_at_once=True):
+        return _run(list(sys.argv[1:] if arguments is None else arguments))
+
+
+def _run(words: list[str]) -> int:
     # Before torch starts its threads: waiting threads that spin make busy machines crawl.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # Read when CUDA starts; without it matrix products on a GPU are not repeatable.
@@ -60,8 +68,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Names of files may hold what is no character: shown as codes, never an error.
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
+    log = logging.getLogger("handavatar")
+    if not any(isinstance(handler, WarningsShown) for handler in log.handlers):
+        log.addHandler(WarningsShown())
     is_debugging = "--debug" in words
-    words = [word for word in words if word != "--debug"]
+    # Of the processes that torchrun starts, the first one reports.
+    is_quiet = "--quiet" in words or os.environ.get("RANK", "0") != "0"
+    words = [word for word in words if word not in ("--debug", "--quiet")]
     if words[:1] == ["--version"]:
         print(f"handavatar {__version__}")
         return 0
@@ -72,7 +85,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if name is None:
         return _no_such_command(words)
     try:
-        return COMMANDS[name](words[len(name.split()) :])
+        with shown_progress(name, is_quiet) as progress:
+            return COMMANDS[name](words[len(name.split()) :], progress)
     except BrokenPipeError:  # the reader, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -90,13 +104,13 @@ def overview(group: str = "") -> str:
     title = "A personal, posable, editable avatar of a hand from an ordinary video."
     return "\n".join(
         [
-            f"usage: handavatar {group or 'COMMAND'} ... [--debug]",
+            f"usage: handavatar {group or 'COMMAND'} ... [--quiet] [--debug]",
             "",
             *([] if group else [title, ""]),
             *lines,
             "",
             "handavatar COMMAND --help shows a command's options; --version the version.",
-            "--debug adds the traceback to an error.",
+            "--quiet shows no progress; --debug adds the traceback to an error.",
         ]
     )
 

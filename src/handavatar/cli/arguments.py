@@ -10,7 +10,9 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
+from handavatar.cli.failures import shown
 from handavatar.cli.inputs import Expected, require
+from handavatar.errors import ArgumentError, require_range
 
 Options = TypeVar("Options")
 
@@ -25,6 +27,8 @@ class Extra:
         help: one line.
         default: value if it is not given; ``...`` means that it is required.
         is_positional: stands without a name, before the others.
+        least: of a number; not looked at where it is above ``most``.
+        most: of a number.
     """
 
     name: str
@@ -32,6 +36,8 @@ class Extra:
     help: str
     default: Any = ...
     is_positional: bool = False
+    least: int | float = 1
+    most: int | float = 0
 
 
 JSON = Extra("json", bool, "print one JSON object and nothing else", False)
@@ -85,6 +91,7 @@ def parse_with(
 
     Raises:
         WrongInput: a path is of another kind.
+        ArgumentError: a number is out of range.
 
     Tyro reads a subclass of the dataclass that carries the command line's own conventions, so
     that the code it serves need not know them.
@@ -105,28 +112,88 @@ def parse_with(
             default = dataclasses.field(default=values[field.name])
             fields.append((field.name, fixed, default))
             continue
+        if dataclasses.is_dataclass(field.type):
+            fields.append(_unchecked_field(field))
+            continue
         named = _comma_separated(field.type)
         kind = _positional(named, field.name) if field.name in positional else named
         # Either of the two is MISSING, which stands for none.
         defaults: Any = {"default": field.default, "default_factory": field.default_factory}
         fields.append((field.name, kind, dataclasses.field(**defaults)))
-    twin = dataclasses.make_dataclass(
-        options.__name__, fields, bases=(options,), kw_only=True, frozen=True
-    )
+    twin: Any = _unchecked(options, fields)
     twin.__doc__ = about or options.__doc__
     parsed: Any = tyro.cli(
         twin, args=words, prog=f"handavatar {command}", config=(tyro.conf.FlagCreatePairsOff,)
     )
-    found = {field.name: getattr(parsed, field.name) for field in own}
+    for extra in extras:
+        if extra.least <= extra.most:
+            require_range(extra.name, getattr(parsed, extra.name), extra.least, extra.most)
+    found = {
+        field.name: _rebuilt(getattr(parsed, field.name), field.type, field.name) for field in own
+    }
     found |= {name: value for name, value in values.items() if found[name] is None}
     for name, expected in (reads or {}).items():
         shown = name.upper() if name in positional else "--" + name.replace("_", "-")
         for path in _paths(getattr(parsed, name)):
             require(path, expected, f"{shown} of handavatar {command}")
+    for name in {*found, *(extra.name for extra in extras)} - set(reads or ()):
+        for path in _paths(getattr(parsed, name)) if _holds_paths(getattr(parsed, name)) else []:
+            _require_utf8(name, path)
     return (
         options(**found),
         {extra.name: getattr(parsed, extra.name) for extra in extras},
     )
+
+
+def _unchecked(kind: type[Any], fields: list[tuple[str, Any, Any]]) -> type[Any]:
+    """A subclass that takes any values: tyro would make what its class says of them a riddle."""
+    namespace = {"__post_init__": lambda self: None}
+    return dataclasses.make_dataclass(
+        kind.__name__, fields, bases=(kind,), namespace=namespace, kw_only=True, frozen=True
+    )
+
+
+def _unchecked_field(field: dataclasses.Field[Any]) -> tuple[str, Any, Any]:
+    """A field that is an options class itself, for tyro."""
+    own: Any = field.type
+    within = [f for f in dataclasses.fields(own) if dataclasses.is_dataclass(f.type)]
+    kind = _unchecked(own, [_unchecked_field(each) for each in within])
+    given: Any = field.default_factory
+    return field.name, kind, dataclasses.field(default_factory=lambda: _rebuilt(given(), kind, ""))
+
+
+def _rebuilt(value: Any, kind: Any, name: str) -> Any:
+    """An options class within another as its own class, which looks at the values; else as it is.
+
+    Raises:
+        ArgumentError: one is out of range; it is named as in ``fit.focal_share``.
+    """
+    if not (dataclasses.is_dataclass(kind) and isinstance(kind, type)):
+        return value
+    try:
+        parts = {
+            field.name: _rebuilt(getattr(value, field.name), field.type, field.name)
+            for field in dataclasses.fields(kind)
+        }
+        return kind(**parts)
+    except ArgumentError as error:
+        raise ArgumentError(
+            f"{name}.{error.argument}", error.found, error.expected, error.remedy
+        ) from error
+
+
+def _holds_paths(value: Any) -> bool:
+    return isinstance(value, Path) or (
+        isinstance(value, tuple) and any(isinstance(each, Path) for each in value)
+    )
+
+
+def _require_utf8(name: str, path: Path) -> None:
+    """What is written must be read again, and safetensors reads no file of another name."""
+    try:
+        str(path).encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise ArgumentError(name, str(path), "a name in UTF-8", "choose plain letters") from error
 
 
 def _paths(value: Any) -> list[Path]:
@@ -183,4 +250,4 @@ def print_figures(value: dict[str, Any], indent: int = 0) -> None:
         elif isinstance(figure, float):
             print(f"{label}  {figure:.4g}")
         else:
-            print(f"{label}  {'-' if figure is None else figure}")
+            print(f"{label}  {'-' if figure is None else shown(str(figure))}")

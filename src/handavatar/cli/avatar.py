@@ -4,11 +4,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from handavatar.errors import ArgumentError
+from handavatar.jobs.progress import Progress
+
 if TYPE_CHECKING:
     from handavatar.train.loop import TrainOptions
 
 
-def train(words: list[str]) -> int:
+def train(words: list[str], progress: Progress) -> int:
     """Capture -> avatar; with --view, live in the browser."""
     from handavatar.cli.arguments import Extra, parse_with
     from handavatar.cli.inputs import CAPTURE, PRIOR
@@ -17,28 +20,36 @@ def train(words: list[str]) -> int:
 
     page = (
         Extra("view", bool, "a page shows the training, and afterwards the avatar", False),
-        Extra("port", int, "of the page; if it is taken, the next free one", 7007),
+        Extra(
+            "port", int, "of the page; if it is taken, the next free one", 7007, least=0, most=65535
+        ),
         Extra("host", str, "where the page listens, as for view", "127.0.0.1"),
         Extra("token", str, "who does not know it does not see the page, as for view", ""),
     )
     reads = {"capture": CAPTURE, "prior": PRIOR}
     options, extras = parse_with(TrainOptions, page, words, "train", ("capture",), reads=reads)
     if extras["view"]:
-        return _train_in_view(options, run_folder(options), extras)
+        return _train_in_view(options, run_folder(options), extras, progress)
     for extra in page:
         if extras[extra.name] != extra.default:
-            raise ValueError(f"--{extra.name}: only with --view")
-    _say_trained(train_avatar(options))
+            raise ArgumentError(extra.name, "only with `view=True`")
+    with progress:
+        run = train_avatar(options, progress)
+    _say_trained(run)
     return 0
 
 
-def _train_in_view(options: "TrainOptions", folder: Path, extras: dict[str, Any]) -> int:
+def _train_in_view(
+    options: "TrainOptions", folder: Path, extras: dict[str, Any], progress: Progress
+) -> int:
     from handavatar.train.loop import train as train_avatar
     from handavatar.view.beside import PageOptions, page_beside
 
     place = PageOptions(folder, extras["port"], extras["host"], extras["token"])
     with page_beside(place) as page:
-        _say_trained(train_avatar(replace(options, out=folder)))
+        with progress:
+            run = train_avatar(replace(options, out=folder), progress)
+        _say_trained(run)
         page.stay()
     return 0
 
@@ -47,36 +58,35 @@ def _say_trained(run: Path) -> None:
     print(f"run: {run}\nnext: handavatar evaluate {run}", flush=True)
 
 
-def evaluate(words: list[str]) -> int:
+def evaluate(words: list[str], progress: Progress) -> int:
     """PSNR, SSIM, LPIPS, mask IoU and what the truth allows, on held-out frames."""
     from handavatar.cli.arguments import JSON, parse_with, print_figures, print_json
     from handavatar.cli.inputs import AVATAR, CAPTURE
     from handavatar.evaluate.run import EvaluateOptions, evaluate_run
-    from handavatar.train.progress import Progress
 
     reads = {"run": AVATAR, "capture": CAPTURE}
     options, extras = parse_with(EvaluateOptions, (JSON,), words, "evaluate", ("run",), reads=reads)
-    with Progress("evaluate", 100) as progress:
-        metrics = evaluate_run(
-            options, lambda share, doing: progress.update(round(100 * share), doing)
-        )
-        progress.update(100)
+    with progress:
+        metrics = evaluate_run(options, progress)
     (print_json if extras["json"] else print_figures)(metrics)
     return 0
 
 
-def edit(words: list[str]) -> int:
+def edit(words: list[str], progress: Progress) -> int:
     """Save light, skin colour, paint and lifted shadows into an avatar."""
     from handavatar.cli.arguments import parse
     from handavatar.cli.inputs import AVATAR, PAINT
     from handavatar.retouch import EditOptions, save_edited
 
     reads = {"run": AVATAR, "paint": PAINT}
-    print(save_edited(parse(EditOptions, words, "edit", ("run",), reads)))
+    options = parse(EditOptions, words, "edit", ("run",), reads)
+    with progress:
+        saved = save_edited(options)
+    print(saved)
     return 0
 
 
-def render(words: list[str]) -> int:
+def render(words: list[str], progress: Progress) -> int:
     """Pictures and video of any pose from any camera."""
     from handavatar.animate import RenderOptions, render_motion
     from handavatar.capture.motion import MOTIONS
@@ -85,13 +95,15 @@ def render(words: list[str]) -> int:
     from handavatar.processes import is_first_process
 
     reads = {"run": AVATAR, "motion": named(MOTION, MOTIONS), "paint": PAINT}
-    folder = render_motion(parse(RenderOptions, words, "render", ("run",), reads))
+    options = parse(RenderOptions, words, "render", ("run",), reads)
+    with progress:
+        folder = render_motion(options, progress)
     if is_first_process():
         print(folder)
     return 0
 
 
-def export(words: list[str]) -> int:
+def export(words: list[str], progress: Progress) -> int:
     """Avatar -> a rigged GLB, a page for any browser, or a posed surface as PLY or OBJ."""
     import sys
 
@@ -99,11 +111,10 @@ def export(words: list[str]) -> int:
     from handavatar.cli.arguments import parse
     from handavatar.cli.inputs import AVATAR, MOTION, PAINT, named
     from handavatar.export.run import ExportOptions, export_avatar
-    from handavatar.train.progress import StagedProgress
 
     reads = {"run": AVATAR, "motion": named(MOTION, MOTIONS), "paint": PAINT}
     options = parse(ExportOptions, words, "export", ("run", "format"), reads)
-    with StagedProgress() as progress:
+    with progress:
         out = export_avatar(options, progress)
     if options.format == "web":
         print((out / "loss.json").read_text(), end="", file=sys.stderr)
@@ -111,12 +122,15 @@ def export(words: list[str]) -> int:
     return 0
 
 
-def view(words: list[str]) -> int:
+def view(words: list[str], progress: Progress) -> int:
     """Live in the browser: pose, camera, layers, light, skin, paint, shadow per finger."""
     from handavatar.cli.arguments import parse
     from handavatar.cli.inputs import MOTION, SHOWN
     from handavatar.view.server import ViewOptions
     from handavatar.view.server import view as serve
 
-    serve(parse(ViewOptions, words, "view", ("run",), {"run": SHOWN, "motion": MOTION}))
+    options = parse(ViewOptions, words, "view", ("run",), {"run": SHOWN, "motion": MOTION})
+    with progress:
+        """Nothing more to tell: it serves until it is stopped."""
+    serve(options)
     return 0

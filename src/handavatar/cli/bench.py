@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from handavatar.cli.failures import USAGE
+from handavatar.jobs.progress import Progress
 
 if TYPE_CHECKING:
     from handavatar.evaluate.tables import ResultTable
@@ -17,7 +18,7 @@ class _Bench:
     """One table: the options it takes, with ``total_steps``, and the function that makes it."""
 
     options: type[Any]
-    make: "Callable[[Any, Callable[[int], None]], ResultTable]"
+    make: "Callable[[Any, Progress], ResultTable]"
 
 
 def _skin() -> _Bench:
@@ -81,12 +82,11 @@ _TABLES: dict[str, Callable[[], _Bench]] = {
 """A new table needs a line here; what it takes and makes is the business of its own module."""
 
 
-def bench(words: list[str]) -> int:
+def bench(words: list[str], progress: Progress) -> int:
     """Measure a table: ``bench --table ablation|geometry|...``, or one of the other names."""
-    from handavatar.cli.arguments import JSON, Extra, parse_with, print_json
+    from handavatar.cli.arguments import JSON, OVERWRITE, Extra, parse_with, print_json
     from handavatar.cli.inputs import AVATAR, CAPTURE
-    from handavatar.jobs.files import write_atomically
-    from handavatar.train.progress import Progress
+    from handavatar.jobs.files import refuse_file_in_use, write_atomically
 
     name = _named_table(words)
     if name not in _TABLES:
@@ -102,13 +102,16 @@ def bench(words: list[str]) -> int:
         Extra("table", str, f"which table: {', '.join(_TABLES)}"),
         Extra("out", Path | None, "Markdown file to write as well", None),
         JSON,
+        OVERWRITE,
     )
     inputs = {"capture": CAPTURE, "captures": CAPTURE, "avatar": AVATAR, "avatars": AVATAR}
     own = {field.name for field in fields(chosen.options)}
     reads = {field: expected for field, expected in inputs.items() if field in own}
     options, extras = parse_with(chosen.options, extras_wanted, words, "bench", reads=reads)
-    with Progress(f"bench {name}", options.total_steps) as progress:
-        table = chosen.make(options, progress.update)
+    if extras["out"] is not None:
+        refuse_file_in_use(extras["out"], extras["overwrite"])
+    with progress:
+        table = chosen.make(options, progress)
     if extras["out"] is not None:
         write_atomically({extras["out"]: table.markdown().encode()})
     if extras["json"]:

@@ -5,13 +5,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from handavatar.cli.failures import BAD_DATA, printable
+from handavatar.cli.failures import BAD_DATA, shown
+from handavatar.errors import ArgumentError
+from handavatar.jobs.progress import Progress, shown_progress
 
 if TYPE_CHECKING:
     from handavatar.capture.video import VideoOptions
 
 
-def video(words: list[str]) -> int:
+def video(words: list[str], progress: Progress) -> int:
     """A video of one bare hand (or several) -> capture: track, mask, fit pose and shape."""
     from handavatar.capture.video import VideoOptions
     from handavatar.cli.arguments import parse
@@ -19,8 +21,7 @@ def video(words: list[str]) -> int:
 
     reads = {"file": VIDEO, "more": VIDEO, "masks": MASKS, "camera": CAMERAS}
     options = parse(VideoOptions, words, "capture video", ("file", "more"), reads)
-    for asked in options.of_each_hand():
-        _capture_hand(asked)
+    _capture_hands(options, progress)
     return 0
 
 
@@ -32,7 +33,7 @@ kept beside OUT, and the command goes on as `handavatar capture video` does.
 """
 
 
-def webcam(words: list[str]) -> int:
+def webcam(words: list[str], progress: Progress) -> int:
     """A hand before the webcam -> capture; a page says what to show; --drive: an avatar follows."""
     from handavatar.capture.video import VideoOptions
     from handavatar.cli.arguments import Extra, parse_with
@@ -52,7 +53,9 @@ def webcam(words: list[str]) -> int:
             "run folder or file of an avatar, which follows the hand beside the camera's picture",
             None,
         ),
-        Extra("port", int, "of the page; if it is taken, the next free one", 7007),
+        Extra(
+            "port", int, "of the page; if it is taken, the next free one", 7007, least=0, most=65535
+        ),
         Extra("host", str, "where the page listens, as for view", "127.0.0.1"),
         Extra("token", str, "who does not know it does not see the page, as for view", ""),
     )
@@ -65,13 +68,15 @@ def webcam(words: list[str]) -> int:
         about=_WEBCAM,
         reads={"drive": AVATAR, "more": VIDEO, "masks": MASKS, "camera": CAMERAS},
     )
+    with progress:
+        """Nothing to tell while the page is open."""
     recording = _record(options, values)
     if recording is None:
         return 0
     print(f"recorded: {recording}", flush=True)
     try:
-        for asked in replace(options, file=recording).of_each_hand():
-            _capture_hand(asked)
+        with shown_progress("capture webcam", progress.is_silent) as shown:
+            _capture_hands(replace(options, file=recording), shown)
     except BaseException:
         print(f"the recording is kept; handavatar capture video {recording} goes on", flush=True)
         raise
@@ -85,7 +90,7 @@ def _record(options: "VideoOptions", values: dict[str, Any]) -> Path | None:
 
     out, drive = values["out"], values["drive"]
     if out is None and drive is None:
-        raise ValueError("--out: say where the capture is to be, or --drive an avatar")
+        raise ArgumentError("out", "say where the capture is to be, or `drive` an avatar")
     sampling = options.sampling()
     longest = sampling.wanted(sampling.max_frames)
     if sampling.end is not None:
@@ -98,41 +103,43 @@ def _record(options: "VideoOptions", values: dict[str, Any]) -> Path | None:
     return record_webcam(asked_page)
 
 
-def _capture_hand(options: "VideoOptions") -> None:
+def _capture_hands(options: "VideoOptions", progress: Progress) -> None:
     from handavatar.capture.video import capture_video
-    from handavatar.capture.video_report import summary_lines
-    from handavatar.train.progress import Progress
 
-    with Progress("capture video", 100) as progress:
-        capture_video(
-            options, progress=lambda share, stage: progress.update(round(100 * share), stage)
-        )
+    hands = options.of_each_hand()
+    with progress:
+        for asked, part in zip(hands, progress.equal_parts(len(hands)), strict=True):
+            capture_video(asked, progress=part)
+    for asked in hands:
+        _say_captured(asked)
+
+
+def _say_captured(options: "VideoOptions") -> None:
+    from handavatar.capture.video_report import summary_lines
+
     skipped = json.loads((options.out / "skipped.json").read_text(encoding="utf-8"))
     for name, reason in skipped["frames"].items():
-        print(f"skipped {name}: {reason}")
+        print(shown(f"skipped {name}: {reason}"))
     fit = json.loads((options.out / "fit.json").read_text(encoding="utf-8"))
     for line in summary_lines(fit["summary"]):
-        print(line)
+        print(shown(line))
     print(f"look at: {options.out / 'overview.png'}")
     print(f"capture: {options.out}\nnext: handavatar train {options.out}")
 
 
-def synth(words: list[str]) -> int:
+def synth(words: list[str], progress: Progress) -> int:
     """A made capture with known albedo, light, shape and pose."""
     from handavatar.capture.synthetic import SynthOptions, make_capture
     from handavatar.cli.arguments import OUT, OVERWRITE, parse_with
-    from handavatar.train.progress import Progress
 
     options, extras = parse_with(SynthOptions, (OUT, OVERWRITE), words, "capture synth")
-    with Progress("capture synth", options.train_frames + options.test_frames) as progress:
-        make_capture(
-            extras["out"], options, extras["overwrite"], lambda done, total: progress.update(done)
-        )
+    with progress:
+        make_capture(extras["out"], options, extras["overwrite"], progress)
     print(f"capture: {extras['out']}\nnext: handavatar train {extras['out']}")
     return 0
 
 
-def degrade(words: list[str]) -> int:
+def degrade(words: list[str], progress: Progress) -> int:
     """A worse copy of a capture: tracking noise, mask erosion, blur, JPEG."""
     from handavatar.capture.degraded import DegradeOptions, degrade_capture
     from handavatar.cli.arguments import OUT, OVERWRITE, parse_with
@@ -146,20 +153,20 @@ def degrade(words: list[str]) -> int:
         ("source",),
         reads={"source": CAPTURE},
     )
-    degrade_capture(extras["out"], options, extras["overwrite"])
+    with progress:
+        degrade_capture(extras["out"], options, extras["overwrite"], progress)
     print(f"capture: {extras['out']}\nnext: handavatar train {extras['out']}")
     return 0
 
 
-def benchmark(words: list[str]) -> int:
+def benchmark(words: list[str], progress: Progress) -> int:
     """The named made captures with known truth: subjects, lightings, transport, worse ones."""
     from handavatar.capture.benchmark import BenchmarkOptions, make_benchmark
     from handavatar.cli.arguments import OUT, parse_with
-    from handavatar.train.progress import Progress
 
     options, extras = parse_with(BenchmarkOptions, (OUT,), words, "capture benchmark")
-    with Progress("capture benchmark", len(options.names())) as progress:
-        folders = make_benchmark(extras["out"], options, progress.update)
+    with progress:
+        folders = make_benchmark(extras["out"], options, progress)
     for folder in folders:
         print(f"capture: {folder}")
     return 0
@@ -176,24 +183,21 @@ class _CheckOptions:
     capture: Path
 
 
-def check(words: list[str]) -> int:
+def check(words: list[str], progress: Progress) -> int:
     """Validate a capture: every problem with file, frame and remedy."""
     from handavatar.capture.soundness import find_problems
     from handavatar.cli.arguments import JSON, parse_with, print_json
     from handavatar.cli.inputs import CHECKED
-    from handavatar.train.progress import Progress
 
     options, extras = parse_with(
         _CheckOptions, (JSON,), words, "capture check", ("capture",), reads={"capture": CHECKED}
     )
-    with Progress("capture check", 100) as progress:
-        problems = find_problems(
-            options.capture, lambda done, total: progress.update(100 * done // total)
-        )
+    with progress:
+        problems = find_problems(options.capture, progress)
     if extras["json"]:
         print_json({"sound": not problems, "problems": [vars(problem) for problem in problems]})
     else:
         for problem in problems:
-            print(printable(str(problem)))
+            print(shown(str(problem)))
         print(f"{options.capture}: {f'{len(problems)} problems' if problems else 'sound'}")
     return BAD_DATA if problems else 0

@@ -3,14 +3,17 @@
 from dataclasses import dataclass
 
 from handavatar.cli.failures import BAD_DATA
+from handavatar.jobs.progress import Progress
 
 
-def demo(words: list[str]) -> int:
+def demo(words: list[str], progress: Progress) -> int:
     """The whole road on the capture that ships: train, evaluate, render, report."""
     from handavatar.cli.arguments import parse
     from handavatar.demo import DemoOptions, run_demo
 
-    run_demo(parse(DemoOptions, words, "demo"))
+    options = parse(DemoOptions, words, "demo")
+    with progress:
+        run_demo(options, progress)
     return 0
 
 
@@ -19,13 +22,14 @@ class _DoctorOptions:
     """Looks at this machine and this installation: what is missing, and the remedy."""
 
 
-def doctor(words: list[str]) -> int:
+def doctor(words: list[str], progress: Progress) -> int:
     """What is missing on this machine, and the command that mends it."""
     from handavatar.cli.arguments import JSON, parse_with, print_json
     from handavatar.doctor import examine
 
     _, extras = parse_with(_DoctorOptions, (JSON,), words, "doctor")
-    findings = examine()
+    with progress:
+        findings = examine()
     is_able = all(finding.state != "missing" for finding in findings)
     if extras["json"]:
         print_json({"able": is_able, "findings": [vars(finding) for finding in findings]})

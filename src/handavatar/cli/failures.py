@@ -1,20 +1,24 @@
 """Errors as exit codes and as a few lines that say what, where, why and what to do."""
 
-import errno
+import ast
+import logging
+import re
+import shlex
 import sys
 import traceback
 
+from handavatar.errors import ARGUMENT_MARK, ErrorKind, HandAvatarError, machine_error
+
 OUR_BUG = 1
-USAGE = 2
-BAD_DATA = 3
-LICENSED_FILE_MISSING = 4
-OUT_OF_SPACE = 5
-NUMERICAL = 6
+USAGE = int(ErrorKind.USAGE)
+BAD_DATA = int(ErrorKind.BAD_DATA)
+LICENSED_FILE_MISSING = int(ErrorKind.LICENSED_FILE_MISSING)
+OUT_OF_SPACE = int(ErrorKind.OUT_OF_SPACE)
+NUMERICAL = int(ErrorKind.NUMERICAL)
 INTERRUPTED = 130
 
 _MAX_LINES = 6
 _MAX_LINE = 400
-_NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.ENOMEM, errno.EFBIG}
 # Which extra brings a package that is not there.
 _EXTRAS = {
     "mediapipe": "video",
@@ -23,6 +27,15 @@ _EXTRAS = {
     "drjit": "synth",
     "anny": "anny",
 }
+
+
+class WarningsShown(logging.Handler):
+    """Warnings of the library, on standard error as its errors are."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Prints one; what no handler would have shown is not shown here either."""
+        if record.levelno >= logging.WARNING:
+            print(shown(f"handavatar: {self.format(record)}"), file=sys.stderr, flush=True)
 
 
 def report_failure(error: BaseException, is_debugging: bool = False) -> int:
@@ -54,11 +67,45 @@ def printable(text: str) -> str:
     )
 
 
+def with_flags(text: str) -> str:
+    """A message of the library as the command line says it: arguments are flags.
+
+    Args:
+        text: in which arguments stand as Python writes them, between backticks.
+    """
+    return ARGUMENT_MARK.sub(_flag, text)
+
+
+def shown(text: str) -> str:
+    """A message of the library, for a terminal: with flags, and with nothing it would obey."""
+    return printable(with_flags(text))
+
+
+def _flag(found: re.Match[str]) -> str:
+    name, value = found[1], found[2]
+    flag = f"--{name.replace('_', '-')}"
+    if value is None or value == "True":
+        return flag
+    if value[0] in "'\"":
+        try:
+            return f"{flag} {shlex.quote(ast.literal_eval(value))}"
+        except (ValueError, SyntaxError):
+            return f"{flag} {value}"
+    return f"{flag} {value}"
+
+
 def explanation(error: BaseException) -> tuple[int, str]:
     """Exit code and text of an error."""
+    code, text = _explained(error)
+    return code, with_flags(text)
+
+
+def _explained(error: BaseException) -> tuple[int, str]:
     text = str(error).strip() or type(error).__name__
     if isinstance(error, KeyboardInterrupt):
         return INTERRUPTED, f"interrupted: {error}" if str(error) else "interrupted"
+    if isinstance(error, HandAvatarError):
+        return int(error.kind), text
     if isinstance(error, ModuleNotFoundError):
         package = (error.name or "").split(".")[0]
         if package in _EXTRAS:
@@ -66,29 +113,11 @@ def explanation(error: BaseException) -> tuple[int, str]:
                 f"this command needs the package {package}, which is not installed\n"
                 f"install it: pip install 'handavatar[{_EXTRAS[package]}]' (or scripts/setup)"
             )
-        return OUR_BUG, f"{type(error).__name__}: {text}"
-    # By name: torch, whose error this is, may not have been imported.
-    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
-        return OUT_OF_SPACE, (
-            f"out of memory ({text.splitlines()[0]})\nclose other programs, or use smaller pictures"
-        )
+    if (refused := machine_error(error)) is not None:
+        return int(refused.kind), str(refused)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        if error.errno in _NO_SPACE:
-            return OUT_OF_SPACE, (
-                f"{where}{error.strerror}\nmake room and run it again; what was finished is kept"
-            )
         return BAD_DATA, f"{where}{error.strerror or text}"
     if isinstance(error, FloatingPointError):
         return NUMERICAL, text
-    if type(error).__name__ == "LicensedRigMissing":
-        return LICENSED_FILE_MISSING, text
-    if type(error).__name__ == "FolderInUse":  # An option names a place that cannot be written.
-        return USAGE, text
-    # RigError, CaptureError, CheckpointError: the kinds that a user's file can cause.
-    if isinstance(error, ValueError) and type(error).__module__.startswith("handavatar."):
-        return BAD_DATA, text
-    # The library names the option that it cannot honour, such as --device cuda without a GPU.
-    if isinstance(error, ValueError) and text.startswith("--"):
-        return USAGE, text
     return OUR_BUG, f"{type(error).__name__}: {text}"

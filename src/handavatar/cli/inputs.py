@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from handavatar.capture.checks import OPTIONAL_FORMATS, PICTURE_FORMATS, is_pattern
+from handavatar.errors import HandAvatarError
 
 _HEAD = 64 * 1024
 """Bytes of a file that are looked at; of a safetensors file, its header."""
@@ -32,7 +33,7 @@ _PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".joblib")
 _STILL_BRANDS = (b"heic", b"heix", b"mif1", b"avif", b"hevc")
 
 
-class WrongInput(ValueError):
+class WrongInput(HandAvatarError):
     """A path that a command cannot take: what it is, what was expected, what to do."""
 
 

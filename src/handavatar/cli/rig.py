@@ -4,6 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from handavatar.jobs.progress import Progress
+from handavatar.jobs.signals import is_stopping, unbroken
+
 if TYPE_CHECKING:
     from handavatar.hand.rig import Rig
 
@@ -20,13 +23,14 @@ class _InfoOptions:
     rig: str = "open-hand"
 
 
-def info(words: list[str]) -> int:
+def info(words: list[str], progress: Progress) -> int:
     """Facts of a rig: counts, size, fingerprint."""
     from handavatar.cli.arguments import JSON, parse_with, print_figures, print_json
     from handavatar.hand.rigs import load_rig
 
     options, extras = parse_with(_InfoOptions, (JSON,), words, "rig info")
-    facts = _facts(load_rig(options.rig))
+    with progress:
+        facts = _facts(load_rig(options.rig))
     (print_json if extras["json"] else print_figures)(facts)
     return 0
 
@@ -48,7 +52,7 @@ class _ImportOptions:
     left_shape: Literal["auto", "kept", "mirrored"] = "auto"
 
 
-def import_mano(words: list[str]) -> int:
+def import_mano(words: list[str], progress: Progress) -> int:
     """Convert a user's MANO file once, safely."""
     from handavatar.cli.arguments import JSON, OVERWRITE, parse_with, print_figures, print_json
     from handavatar.cli.inputs import MANO_FILE
@@ -63,8 +67,9 @@ def import_mano(words: list[str]) -> int:
         ("file",),
         reads={"file": MANO_FILE},
     )
-    model = read_mano(options.file, options.left_shape)
-    path = save_rig(model, options.out, extras["overwrite"])
+    with progress:
+        model = read_mano(options.file, options.left_shape)
+        path = save_rig(model, options.out, extras["overwrite"])
     facts = {"file": str(path), "side": model.side, "left_shape": model.left_shape}
     facts |= _facts(model.rig) | {"licence": LICENCE}
     if extras["json"]:
@@ -95,12 +100,19 @@ def _facts(rig: "Rig") -> dict[str, Any]:
     }
 
 
-def refine(words: list[str]) -> int:
+def refine(words: list[str], progress: Progress) -> int:
     """Refine the skinning weights of the high-resolution rig; four bones per vertex."""
     import json
     from dataclasses import asdict
 
-    from handavatar.cli.arguments import JSON, Extra, parse_with, print_figures, print_json
+    from handavatar.cli.arguments import (
+        JSON,
+        OVERWRITE,
+        Extra,
+        parse_with,
+        print_figures,
+        print_json,
+    )
     from handavatar.evaluate.skin_table import evaluation_poses, measure_skin
     from handavatar.hand.open_hand import Level, load_open_hand
     from handavatar.hand.skin_refinement import (
@@ -110,33 +122,39 @@ def refine(words: list[str]) -> int:
         refine_skin,
     )
     from handavatar.hand.sparse_skin import SparseSkin
-    from handavatar.train.progress import Progress
+    from handavatar.jobs.files import refuse_file_in_use
 
     extras_wanted = (
         Extra("out", Path, "file to write (safetensors)", Path("skin.safetensors")),
         Extra("level", Level, "full is the default rig, 778 the one of MANO's size", "full"),
-        Extra("rounds", int, "midpoint subdivisions", 2),
+        Extra("rounds", int, "midpoint subdivisions", 2, least=0, most=4),
         Extra("resume", bool, "continue from OUT.part, which a stopped run has left", False),
         JSON,
+        OVERWRITE,
     )
     options, extras = parse_with(RefinementOptions, extras_wanted, words, "rig refine")
     out: Path = extras["out"]
     base = load_open_hand(extras["level"])
     problem = SkinRefinement.of(base, extras["rounds"], options)
     part = out.with_name(out.name + ".part")
+    refuse_file_in_use(out, extras["overwrite"])
+    refuse_file_in_use(part, extras["overwrite"] or extras["resume"])
     is_continued = extras["resume"] and part.is_file()
     state = RefinementState.load(part, problem) if is_continued else problem.begin()
-    with Progress("rig refine", problem.total_steps, state.step) as progress:
+    progress.skip(state.step, problem.total_steps)
+    with progress:
 
-        def report(now: RefinementState, figures: dict[str, float]) -> None:
-            progress.update(now.step, "refit" if now.step > options.steps else "", **figures)
-            if now.step % 50 == 0:
-                now.save(part, problem)
+        def keep(now: RefinementState, figures: dict[str, float]) -> None:
+            if now.step % 50 == 0 or is_stopping():
+                with unbroken():
+                    now.save(part, problem)
+            note = "refit" if now.step > options.steps else ""
+            progress(now.step, problem.total_steps, note, **figures)
 
-        skins = refine_skin(problem, state, report)
-    made = SparseSkin.of(skins.fitted, base, extras["rounds"])
-    made.save(out, {"rig": base.name, "options": json.dumps(asdict(options))})
-    part.unlink(missing_ok=True)
+        skins = refine_skin(problem, state, keep)
+        made = SparseSkin.of(skins.fitted, base, extras["rounds"])
+        made.save(out, {"rig": base.name, "options": json.dumps(asdict(options))})
+        part.unlink(missing_ok=True)
     poses = evaluation_poses(base, 20)
     rows = {
         "averaged": problem.fine.skin_weights,

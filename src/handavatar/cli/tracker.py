@@ -1,32 +1,23 @@
 """``handavatar tracker``: our own eyes, taught by made pictures."""
 
+from handavatar.jobs.progress import Progress
 
-def train(words: list[str]) -> int:
+
+def train(words: list[str], progress: Progress) -> int:
     """Teach the hand tracker on made pictures."""
-    from contextlib import ExitStack
-
     from handavatar.cli.arguments import parse
     from handavatar.cli.inputs import TRACKER
     from handavatar.synthetic.lessons import TrackerTrainOptions, train_made_tracker
-    from handavatar.train.progress import Progress
 
     options = parse(TrackerTrainOptions, words, "tracker train", reads={"start": TRACKER})
-    bars: dict[str, Progress] = {}
-    with ExitStack() as shown:
-
-        def report(doing: str, done: int, total: int, loss: float) -> None:
-            if doing not in bars:
-                shown.close()
-                bars[doing] = shown.enter_context(Progress(doing, total))
-            bars[doing].update(done, loss=loss)
-
-        train_made_tracker(options, report)
+    with progress:
+        train_made_tracker(options, progress)
     print(f"tracker: {options.out}")
     print(f"next: handavatar tracker evaluate --tracker {options.out}")
     return 0
 
 
-def evaluate(words: list[str]) -> int:
+def evaluate(words: list[str], progress: Progress) -> int:
     """How well a tracker sees made pictures that it was not taught with."""
     from dataclasses import asdict
 
@@ -37,6 +28,7 @@ def evaluate(words: list[str]) -> int:
     options, extras = parse_with(
         TrackerEvaluateOptions, (JSON,), words, "tracker evaluate", reads={"tracker": TRACKER}
     )
-    figures: dict[str, object] = asdict(evaluate_made_tracker(options))
+    with progress:
+        figures: dict[str, object] = asdict(evaluate_made_tracker(options))
     (print_json if extras["json"] else print_figures)(figures)
     return 0

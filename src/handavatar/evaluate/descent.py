@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from handavatar.jobs.finite import require_finite
+from handavatar.jobs.signals import stop_point
 
 _DECAY = 0.05
 """The learning rate falls by this factor until the end, exponentially."""
@@ -26,6 +27,7 @@ def descend(module: nn.Module, loss_of_step: Callable[[], Tensor], steps: int, r
     optimizer = torch.optim.Adam(module.parameters(), lr=rate)
     falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, _DECAY ** (1 / max(steps, 1)))
     for step in range(steps):
+        stop_point()
         loss = loss_of_step()
         require_finite({"loss": loss}, f"{type(module).__name__}, step {step + 1}")
         optimizer.zero_grad()

@@ -7,6 +7,8 @@ from jaxtyping import Float, Int
 from scipy import stats
 from torch import Tensor
 
+from handavatar.errors import HandAvatarError
+
 
 @dataclass(frozen=True)
 class Interval:
@@ -35,10 +37,10 @@ def mean_interval(samples: Float[Tensor, "samples"], level: float = 0.95) -> Int
         level: of confidence.
 
     Raises:
-        ValueError: if there are fewer than two samples.
+        HandAvatarError: if there are fewer than two samples.
     """
     if len(samples) < 2:
-        raise ValueError(
+        raise HandAvatarError(
             f"a confidence interval needs two samples or more, found {len(samples)}: "
             "take more poses, pictures or seeds"
         )

@@ -4,7 +4,6 @@ The truth is path traced once more without the lifted bones' skin. Where both pi
 point of the hand, one holds the light with the finger's shadow, the other the light without it.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -17,11 +16,13 @@ from handavatar.capture.checks import CaptureError, load_json
 from handavatar.capture.frames import Capture, Frame, read_capture
 from handavatar.capture.synthetic import Subject, SynthOptions, lifted_truths, make_subject
 from handavatar.edit import Edit, bones_named
+from handavatar.errors import require_ranges
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.metrics import psnr
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.hand.detail import subdivided
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.progress import SILENT, Progress
 
 CHANGED = 4 / 255
 """A pixel counts as shaded by the finger if its true colour changes by more, in any channel."""
@@ -47,6 +48,10 @@ class LiftTableOptions:
     frames: int = 8
     samples: int = 144
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, frames=(1, 10**5), samples=(1, 65_536))
+
     @property
     def total_steps(self) -> int:
         """Truths, and pictures of all avatars with and without the edit."""
@@ -68,14 +73,12 @@ class LiftedFrame:
     is_changed: Bool[Tensor, "height width"]
 
 
-def lift_table(
-    options: LiftTableOptions, report: Callable[[int], None] | None = None
-) -> ResultTable:
+def lift_table(options: LiftTableOptions, progress: Progress = SILENT) -> ResultTable:
     """Renders truths and avatars, and compares them where the finger's shadow falls.
 
     Args:
         options: what to compare.
-        report: told the number of pieces of work done.
+        progress: told the number of pieces of work done.
 
     Raises:
         CaptureError: if the capture is none that was made here.
@@ -91,7 +94,7 @@ def lift_table(
     names = [path.name for path in avatars]
     # Two runs may end in the same word; then their whole paths tell them apart.
     labels = {path: path.name if names.count(path.name) == 1 else str(path) for path in avatars}
-    finished = step_counter(report)
+    finished = step_counter(progress, options.total_steps)
     test = capture.split("test")
     places = torch.linspace(0, len(test) - 1, min(options.frames, len(test))).round().long()
     frames = [capture.frame(test[place]) for place in places.tolist()]

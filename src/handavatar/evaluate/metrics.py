@@ -14,6 +14,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn.functional import conv2d
 
+from handavatar.errors import HandAvatarError
 from handavatar.evaluate.flip import flip_map
 
 PSNR_CEILING = 100.0
@@ -185,7 +186,7 @@ class JudgedFrame:
         """
         union = self.seen_mask | self.truth_mask
         if not bool(union.any()):
-            raise ValueError("neither the photograph nor the rendering shows a hand")
+            raise HandAvatarError("neither the photograph nor the rendering shows a hand")
         margin = REGION_MARGIN * max(1.0, union.shape[1] / 256)
         return dilated(union, margin) & self.known
 
@@ -429,7 +430,7 @@ def _pooled(
 
 def _mean(values: Sequence[float]) -> float:
     if not values:
-        raise ValueError("there is no frame to judge")
+        raise HandAvatarError("there is no frame to judge", "", "choose another split or capture")
     return math.fsum(values) / len(values)
 
 

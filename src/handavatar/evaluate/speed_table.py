@@ -6,7 +6,6 @@ same for every ray, so it is timed on some rays of each picture, drawn at random
 
 import math
 import multiprocessing
-import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -33,6 +32,7 @@ from handavatar.avatar import (
     RenderSettings,
     chosen_device,
 )
+from handavatar.errors import require_range, require_ranges
 from handavatar.evaluate.published_coap import published_coap_query
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.geometry.cameras import (
@@ -44,6 +44,7 @@ from handavatar.geometry.cameras import (
 )
 from handavatar.hand.pose import BONE_PARENTS, NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import GESTURES, gesture_rotations
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.plain import plain_rays
 
 _WAYS = {
@@ -95,6 +96,18 @@ class SpeedTableOptions:
     hands: tuple[int, ...] = (1, 2, 4, 8)
     device: str = "auto"
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            size=(2, 4096),
+            poses=(1, len(GESTURES)),
+            plain_rays=(1, 4096**2),
+            plain_points=(1, 10**6),
+            sizes=(2, 4096),
+            hands=(1, 64),
+        )
+
     @property
     def total_steps(self) -> int:
         """Pictures and the choice of the reference's pieces."""
@@ -121,29 +134,22 @@ class Scene:
     rays: Rays
 
 
-def speed_table(
-    options: SpeedTableOptions, report: Callable[[int], None] | None = None
-) -> ResultTable:
+def speed_table(options: SpeedTableOptions, progress: Progress = SILENT) -> ResultTable:
     """Times the plain reference, the exact and the near-exact way side by side.
 
     Args:
         options: what to time.
-        report: told the number of pieces of work done.
+        progress: told the number of pieces of work done.
 
     Raises:
         CheckpointError: if the avatar cannot be read.
         ValueError: if there are fewer rays or poses than can be chosen.
     """
-    if not 1 <= options.poses <= len(GESTURES):
-        raise ValueError(f"--poses: found {options.poses}, expected 1 to {len(GESTURES)}")
-    if not 1 <= options.plain_rays <= options.size**2:
-        raise ValueError(
-            f"--plain-rays: found {options.plain_rays}, expected 1 to {options.size**2}"
-        )
+    require_range("plain_rays", options.plain_rays, 1, options.size**2)
     device = chosen_device(options.device)
     ways = _ways(device)
     avatar = HandAvatar.load(options.avatar).moved_to(device)
-    finished = step_counter(report)
+    finished = step_counter(progress, options.total_steps)
     with torch.no_grad():
         scenes = [
             _scene(avatar, name, number, options.size, options.plain_rays)
@@ -393,6 +399,10 @@ def most_memory(device: torch.device) -> float:
         # Not `ru_maxrss`: a process that another one starts inherits the other's peak there.
         status = Path("/proc/self/status").read_text()
         return int(status.partition("VmHWM:")[2].split()[0]) * 1024 / 1e6
+    if sys.platform == "win32":
+        raise OSError("Windows does not tell how much memory a process has held at most")
+    resource = import_module("resource")
+
     # Told in kilobytes, but in bytes on a Mac.
     unit = 1e6 if sys.platform == "darwin" else 1e3
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 
 from handavatar.jobs.files import FolderKind
+from handavatar.jobs.progress import Progress
 
 TABLES = FolderKind("tables")
 """A folder in which the figures behind tables are kept."""
@@ -39,15 +40,14 @@ class ResultTable:
         return f"### {self.title}\n\n" + "\n".join(lines) + "\n" + notes
 
 
-def step_counter(report: Callable[[int], None] | None) -> Callable[[], None]:
-    """A function that tells ``report`` how often it has been called; silent without one."""
+def step_counter(progress: Progress, total: int) -> Callable[[], None]:
+    """A function that tells how often it has been called, of so many times."""
     done = 0
 
     def finished() -> None:
         nonlocal done
         done += 1
-        if report is not None:
-            report(done)
+        progress(done, total)
 
     return finished
 

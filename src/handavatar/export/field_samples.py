@@ -2,7 +2,6 @@
 
 import copy
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -24,6 +23,7 @@ from handavatar.hand.pose_sampling import (
     resolve_penetration,
     sample_poses,
 )
+from handavatar.jobs.progress import SILENT, Progress
 
 NUM_POINTS = 2048
 """Vertices, drawn anew in every pose, whose light is looked up."""
@@ -113,7 +113,7 @@ def sample_field(
     avatar: HandAvatar,
     rotations: Float[Tensor, "poses turns bones 3"],
     generator: torch.Generator,
-    tell: Callable[[int], None] = lambda number: None,
+    progress: Progress = SILENT,
     num_points: int = NUM_POINTS,
     light: int | None = None,
 ) -> FieldSamples:
@@ -124,7 +124,7 @@ def sample_field(
         rotations: of the poses; those in a row differ in the wrist alone, and what surrounds a
             place of the skin is looked up for all of them at once.
         generator: draws points and lifted fingers.
-        tell: called with the number of every pose that is done.
+        progress: told how many poses are done.
         num_points: drawn per pose.
         light: that shines, of several; None is the one in which the avatar is shown.
 
@@ -136,7 +136,7 @@ def sample_field(
     rows: list[tuple[Tensor, ...]] = []
     for number, turned in enumerate(rotations):
         rows += _in_pose(plain, turned, number, num_points, generator)
-        tell(number)
+        progress(number + 1, len(rotations))
     columns = [torch.stack(column) for column in zip(*rows, strict=True)]
     return FieldSamples(rotations.flatten(0, 1), *columns)
 

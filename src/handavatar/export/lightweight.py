@@ -5,7 +5,6 @@ it loses is measured on poses that it was not fitted to.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -42,13 +41,13 @@ from handavatar.geometry.meshes import (
 )
 from handavatar.hand.rig import ShapedHand
 from handavatar.hand.sparse_skin import SparseSkin
+from handavatar.jobs.progress import SILENT, Progress
 
 NUM_POSES = 420
 """Poses of the fingers; of them one in seven is held out."""
 NUM_TRACED_POSES = 280
 """Where light is traced, which takes thrice as long; half as many lose 0.7 dB of colour."""
 _HELD_OUT = 7
-Tell = Callable[[str, int, int], None]
 """Hears what is being done, how many steps of it are done, and of how many."""
 
 
@@ -136,7 +135,7 @@ class LightweightHand:
 def lightweight_hand(
     avatar: HandAvatar,
     edit: Edit,
-    tell: Tell = lambda job, step, total: None,
+    progress: Progress = SILENT,
     effort: Effort | None = None,
 ) -> LightweightHand:
     """Fits a lightweight hand to an avatar; the same avatar gives the same hand.
@@ -145,10 +144,17 @@ def lightweight_hand(
         avatar: on the CPU.
         edit: its paint is laid on the avatar's own, and it chooses the light; all else of edits is
             for the page.
-        tell: hears what is being done.
+        progress: told how far it is.
         effort: poses and steps; by default what the avatar asks for.
     """
     effort = effort or Effort.for_avatar(avatar)
+    stages = progress.stages(
+        {
+            "fields": 1.0 * effort.poses,
+            "surroundings": 0.1 * effort.poses,
+            "shading network": 0.02 * effort.steps,
+        }
+    )
     hand = average_hand(avatar)
     base = avatar.base_rig
     levels = subdivision_levels(base.faces, base.num_vertices, avatar.rounds)
@@ -158,7 +164,7 @@ def lightweight_hand(
         avatar,
         rotations,
         generator,
-        lambda number: tell("fields", number + 1, effort.poses),
+        stages["fields"],
         light=edit.light,
     )
     is_held_out = torch.arange(effort.poses) % _HELD_OUT == 0
@@ -167,6 +173,7 @@ def lightweight_hand(
     correctives = stored_correctives(fit_correctives(known, hand))
     rest = carried_to_fine(correctives.vertices, levels)
     hand = replace(hand, rest_vertices=rest, rest_joints=correctives.joints)
+    stages["surroundings"](0.0)
     near, normals = _shading_normals(avatar, hand)
     capsules = fit_capsules(hand)
     around, around_held_out = (
@@ -178,7 +185,7 @@ def lightweight_hand(
             around,
             levels,
             effort.steps,
-            tell=lambda step: tell("shading network", step + 1, effort.steps),
+            progress=stages["shading network"],
         )
     )
     with torch.no_grad():

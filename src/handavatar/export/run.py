@@ -12,9 +12,10 @@ from handavatar.avatar import HandAvatar
 from handavatar.capture.motion import Motion, gesture, open_motion
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
+from handavatar.errors import ArgumentError, require_ranges
 from handavatar.export.baking import baked_textures, colors_at_vertices
 from handavatar.export.gltf import glb_bytes
-from handavatar.export.lightweight import Tell, lightweight_hand
+from handavatar.export.lightweight import lightweight_hand
 from handavatar.export.polygons import obj_bytes, ply_bytes
 from handavatar.export.rigged import MIRROR, skinned_mesh
 from handavatar.export.skeletons import BoneNames
@@ -26,9 +27,11 @@ from handavatar.jobs.files import (
     FolderKind,
     UnfinishedFolder,
     files_named,
+    refuse_file_in_use,
     refuse_folder_in_use,
     write_atomically,
 )
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.retouch import Look
 
 MAX_TEXTURE = 8192
@@ -65,13 +68,18 @@ class ExportOptions(Look):
     unlit: bool = False
     overwrite: bool = False
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        super().__post_init__()
+        require_ranges(self, texture_size=(16, MAX_TEXTURE))
 
-def export_avatar(options: ExportOptions, tell: Tell = lambda job, step, total: None) -> Path:
+
+def export_avatar(options: ExportOptions, progress: Progress = SILENT) -> Path:
     """Writes the files, aside first.
 
     Args:
         options: what to write.
-        tell: hears how far work is that takes minutes.
+        progress: told how far it is.
 
     Returns:
         The file or folder that was asked for.
@@ -79,15 +87,16 @@ def export_avatar(options: ExportOptions, tell: Tell = lambda job, step, total: 
     Raises:
         CheckpointError: if the avatar cannot be read.
         CaptureError: if the motion or the paint cannot be read, or there is no such gesture.
-        ValueError: for options that contradict each other, or a file that is there already.
-        FolderInUse: if the folder of a page holds something that may not be replaced.
+        ValueError: for options that contradict each other.
+        FolderInUse: if a file is there already, or the folder of a page holds something that may
+            not be replaced.
     """
     options.check_look()
     _check(options)
     avatar = HandAvatar.load(options.run)
     edit = options.edit_on(avatar)
     if options.format == "web":
-        _write_web(avatar, edit, options, tell)
+        _write_web(avatar, edit, options, progress)
         return options.out
     if options.format == "glb":
         contents = [_glb(avatar, edit, options)]
@@ -103,22 +112,20 @@ def _check(options: ExportOptions) -> None:
     """Refuses what contradicts itself, before anything is read."""
     if options.format == "web":
         if options.pose != "flat" or options.unlit:
-            raise ValueError("--pose, --unlit: a page begins in the capture's pose, and is lit")
+            name = "pose" if options.pose != "flat" else "unlit"
+            raise ArgumentError(name, "a page begins in the capture's pose, and is lit")
         refuse_folder_in_use(options.out, WEB_PAGE, options.overwrite, _inputs(options))
         return
     if options.out.suffix.lower() != f".{options.format}":
-        raise ValueError(f"--out {options.out}: expected a name that ends in .{options.format}")
-    if not 16 <= options.texture_size <= MAX_TEXTURE:
-        raise ValueError(
-            f"--texture-size {options.texture_size}: expected 16 to {MAX_TEXTURE} texels"
-        )
+        raise ArgumentError("out", str(options.out), f"a name that ends in .{options.format}")
     if options.format == "glb" and options.pose != "flat":
-        raise ValueError("--pose: a GLB is in its rest pose; animate it with --motion")
+        raise ArgumentError("pose", "a GLB is in its rest pose; animate it with `motion`")
     if options.format != "glb" and options.motion is not None:
-        raise ValueError(f"--motion: {options.format.upper()} cannot move; choose glb, or --pose")
+        raise ArgumentError(
+            "motion", f"{options.format.upper()} cannot move; choose glb, or `pose`"
+        )
     for path in _files(options):
-        if path.exists() and not (options.overwrite and path.is_file()):
-            raise ValueError(f"--out: {path} exists; name another file, or add --overwrite")
+        refuse_file_in_use(path, options.overwrite)
 
 
 def _inputs(options: ExportOptions) -> list[Path]:
@@ -144,9 +151,9 @@ def _motion(avatar: HandAvatar, edit: Edit, options: ExportOptions) -> Motion | 
     return open_motion(options.motion, avatar.base_rig, start_of(avatar.view(edit)))
 
 
-def _write_web(avatar: HandAvatar, edit: Edit, options: ExportOptions, tell: Tell) -> None:
+def _write_web(avatar: HandAvatar, edit: Edit, options: ExportOptions, progress: Progress) -> None:
     motion = _motion(avatar, edit, options)
-    light = lightweight_hand(avatar, edit, tell)
+    light = lightweight_hand(avatar, edit, progress)
     folder = UnfinishedFolder(options.out, WEB_PAGE, {"format": "web"}, _inputs(options))
     try:
         folder.begin(options.overwrite)

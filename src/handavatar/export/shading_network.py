@@ -6,7 +6,6 @@ of 256. Here each vertex has a few latents; what hides it is told by capsules ar
 biases of the first of two layers of 32.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -20,6 +19,7 @@ from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.pose_features import NUM_POSE_FEATURES, pose_features
 from handavatar.hand.rig import PosedHand, ShapedHand
+from handavatar.jobs.progress import SILENT, Progress
 
 NUM_LATENTS = 8
 WIDTH = 32
@@ -134,7 +134,7 @@ def fit_shading(
     levels: list[Subdivision],
     steps: int = STEPS,
     seed: int = 0,
-    tell: Callable[[int], None] = lambda step: None,
+    progress: Progress = SILENT,
 ) -> ShadingNetwork:
     """A network that says of the samples' points what the field says, lifted shadows included.
 
@@ -144,7 +144,7 @@ def fit_shading(
         levels: of subdivision.
         steps: of the optimisation; every other one sees lifted shadows.
         seed: of the weights and of the draw; the same one gives the same network.
-        tell: called with the number of every step that is done.
+        progress: told the steps done.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
@@ -175,7 +175,7 @@ def fit_shading(
         torch.nn.functional.mse_loss(found, light).backward()
         optimizer.step()
         schedule.step()
-        tell(step)
+        progress(step + 1, steps)
     return network.eval().requires_grad_(False)
 
 

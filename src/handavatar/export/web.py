@@ -18,6 +18,7 @@ from handavatar.avatar import HandAvatar
 from handavatar.capture.motion import MORE_GESTURES, Motion, gesture, middle_of_hand
 from handavatar.capture.view import camera_holding, start_of
 from handavatar.edit import Edit
+from handavatar.errors import HandAvatarError
 from handavatar.export.capsules import REACH
 from handavatar.export.lightweight import LightweightHand
 from handavatar.export.packing import Packed, packed_bytes, quantised
@@ -57,9 +58,9 @@ def web_files(
     about = facts(avatar, light, edit, motion) | {"arrays": index}
     page = page_bytes(about, content)
     if len(page) > LARGEST:
-        raise ValueError(
+        raise HandAvatarError(
             f"the page has {len(page)} bytes, at most {LARGEST} are allowed: "
-            "leave out --motion, or train on a coarser rig"
+            "leave out `motion`, or train on a coarser rig"
         )
     figures = {name: round(value, 4) for name, value in light.loss.items()}
     loss = json.dumps(figures | {"bytes": len(page)}, indent=2) + "\n"

@@ -6,6 +6,8 @@ from typing import Literal
 
 import torch
 
+from handavatar.errors import ArgumentError
+
 Precision = Literal["tf32x3", "tf32", "bf16"]
 """Of the factors of matrix products; sums and everything else have 32 bits. Three products of
 19-bit factors (``tf32x3``) are nearly as good as one of 32-bit factors, which tensor cores lack and
@@ -26,7 +28,7 @@ def chosen_kernel(name: Kernel, device: torch.device | str) -> Kernel:
     """What decodes pairs on a device; never ``auto``.
 
     Raises:
-        ValueError: if Triton is asked for where it is missing or there is no NVIDIA GPU.
+        ArgumentError: if Triton is asked for where it is missing or there is no NVIDIA GPU.
     """
     if name == "torch":
         return name
@@ -34,13 +36,15 @@ def chosen_kernel(name: Kernel, device: torch.device | str) -> Kernel:
     if name == "auto":
         return "triton" if is_cuda and _has_triton() and _has_tensor_cores() else "torch"
     if not _has_triton():
-        raise ValueError(
-            f"--kernel {name}: there is no package 'triton' here; it comes with torch's builds for "
-            "CUDA; use --kernel torch"
+        raise ArgumentError(
+            "kernel",
+            f"{name}: there is no package 'triton' here; it comes with torch's builds for CUDA",
+            "",
+            "use `kernel='torch'`",
         )
     if not is_cuda:
-        raise ValueError(
-            f"--kernel {name}: needs a CUDA device, found {device}; use --kernel torch"
+        raise ArgumentError(
+            "kernel", f"{name} needs a CUDA device, found {device}", "", "use `kernel='torch'`"
         )
     return name
 

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from handavatar.errors import require_ranges
 from handavatar.fit.appearance import SkinTexture, look_up_points
 from handavatar.fit.contact import Balls, overlaps
 from handavatar.fit.kinematics import (
@@ -66,6 +67,22 @@ class EnergyOptions:
     """Weight of a point of the skin that a tracker sees: neighbours err together."""
     depth_share: float = 0.5
     """Weight of a landmark's depth."""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            outline_error=(1e-3, 1e3),
+            outline_outlier=(1e-3, 1e3),
+            outline_points=(1, 1e6),
+            turn_cost=(0, 1e4),
+            texture_outlier=(1e-3, 1e3),
+            texture_share=(0, 1e3),
+            contact_error=(1e-6, math.inf),
+            landmark_outlier=(1e-3, 1e6),
+            skin_share=(0, 1e3),
+            depth_share=(0, 1e3),
+        )
 
 
 @dataclass(frozen=True, eq=False)

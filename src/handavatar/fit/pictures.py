@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import binary_dilation
 from torch import Tensor
 from torch.nn.functional import conv2d, grid_sample, normalize, pad
@@ -19,30 +19,30 @@ _BAND_RATIO = 2.5
 """Of the two blurs of a band."""
 _DARKEST = 0.02
 """Of colours in [0, 1]: noise has more to say in darker ones."""
+_HAND, _KNOWN, _OUTLINE = 1, 2, 4
+"""Bits of a pixel's marks."""
 _LEAST_SHARE = 0.03
 """Of the hand's pixels under a blur."""
 
 
 @dataclass(frozen=True, eq=False)
 class FramePicture:
-    """One frame as a fit sees it.
+    """One frame as a fit sees it, in few bytes: a fit holds those of all frames.
 
     Attributes:
         camera: of this picture.
-        color: sRGB in [0, 1], divided by the frame's gain.
-        hand: pixels that belong to the hand, known ones alone.
-        known: of which anything is known.
-        has_outline: where the outline that is nearest was seen.
+        pixels: sRGB, levels to 255 or in [0, 1].
+        gain: of the channels.
+        marks: bits of each pixel: belongs to the hand, is known, has an outline.
         distance: pixels from the outline of the hand, negative inside.
         border: points on the outline, where both of its sides are known, pixels.
         border_normals: unit, away from the hand.
     """
 
     camera: Camera
-    color: Float[Tensor, "height width 3"]
-    hand: Bool[Tensor, "height width"]
-    known: Bool[Tensor, "height width"]
-    has_outline: Bool[Tensor, "height width"]
+    pixels: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"]
+    gain: Float[Tensor, "3"]
+    marks: UInt8[Tensor, "height width"]
     distance: Float[Tensor, "height width"]
     border: Float[Tensor, "border 2"]
     border_normals: Float[Tensor, "border 2"]
@@ -50,7 +50,7 @@ class FramePicture:
     @staticmethod
     def of(
         camera: Camera,
-        color: Float[Tensor, "height width 3"],
+        pixels: UInt8[Tensor, "height width 3"] | Float[Tensor, "height width 3"],
         coverage: Float[Tensor, "height width"],
         known: Bool[Tensor, "height width"],
         gain: Float[Tensor, "3"],
@@ -59,7 +59,7 @@ class FramePicture:
 
         Args:
             camera: of the picture.
-            color: sRGB in [0, 1].
+            pixels: sRGB, levels to 255 or in [0, 1].
             coverage: of each pixel by the hand, in [0, 1].
             known: false where neither is known.
             gain: of the channels.
@@ -68,9 +68,29 @@ class FramePicture:
         distance = blur(distance[..., None], 1.0)[..., 0]
         border, normals = _border_of(distance, known)
         hand = (coverage > 0.9) & known
-        return FramePicture(
-            camera, color / gain, hand, known, has_outline, distance, border, normals
-        )
+        marks = _HAND * hand.byte() + _KNOWN * known.byte() + _OUTLINE * has_outline.byte()
+        return FramePicture(camera, pixels, gain, marks, distance, border, normals)
+
+    @property
+    def color(self) -> Float[Tensor, "height width 3"]:
+        """SRGB in [0, 1], divided by the frame's gain."""
+        values = self.pixels if self.pixels.is_floating_point() else self.pixels.float() / 255
+        return values / self.gain
+
+    @property
+    def hand(self) -> Bool[Tensor, "height width"]:
+        """Pixels that belong to the hand, known ones alone."""
+        return (self.marks & _HAND) > 0
+
+    @property
+    def known(self) -> Bool[Tensor, "height width"]:
+        """Pixels of which anything is known."""
+        return (self.marks & _KNOWN) > 0
+
+    @property
+    def has_outline(self) -> Bool[Tensor, "height width"]:
+        """Where the outline that is nearest was seen."""
+        return (self.marks & _OUTLINE) > 0
 
     def is_known(self, pixels: Float[Tensor, "points 2"]) -> Bool[Tensor, "points"]:
         """Whether anything is known of the pixels of these points; not beyond the picture."""

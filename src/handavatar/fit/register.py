@@ -8,12 +8,13 @@ how far they had to move. The texture comes last, when the start is not spoilt, 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.fit.appearance import SkinTexture, fit_texture, look_up_points
 from handavatar.fit.contact import fill_with_balls
 from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
@@ -26,10 +27,9 @@ from handavatar.geometry.meshes import SurfacePoints, sample_surface_evenly
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import Rig, ShapedHand
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.stage_states import NOT_KEPT, StageState, WorkState
 from handavatar.jobs.threads import one_thread
-
-Progress = Callable[[float], None]
-"""Told the share that is done, in [0, 1]."""
 
 _NUM_POINTS = 4096
 _WIDE, _MIDDLE, _NARROW = 6.0, 3.0, 1.5
@@ -85,6 +85,19 @@ class RegisterOptions:
     energy: EnergyOptions = field(default_factory=EnergyOptions)
     """Expected errors of what is observed."""
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            pose_error=(0.01, 180),
+            tilts=(0, 180),
+            restarts=(0, 1000),
+            texture_sigmas=(0.1, 100),
+            texture_rounds=(0, 1000),
+            coefficient_sigma=(1e-3, 10),
+            seed=SEEDS,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class Registered:
@@ -124,7 +137,8 @@ def register(
     options: RegisterOptions,
     is_sequence: bool = False,
     learns_shape: bool = True,
-    progress: Progress | None = None,
+    progress: Progress = SILENT,
+    kept: StageState = NOT_KEPT,
 ) -> Registered:
     """Lays one hand onto all frames.
 
@@ -139,6 +153,10 @@ def register(
         is_sequence: whether the frames are neighbours in time.
         learns_shape: whether the hand's shape moves.
         progress: told how far it is.
+        kept: where it goes on, if it was interrupted.
+
+    Raises:
+        Interrupted: if the command was told to stop.
     """
     threads = torch.get_num_threads()
     with one_thread():
@@ -150,7 +168,8 @@ def register(
             options,
             is_sequence,
             learns_shape,
-            progress or (lambda share: None),
+            progress,
+            kept,
             threads,
         )
 
@@ -163,7 +182,8 @@ def _register(
     options: RegisterOptions,
     is_sequence: bool,
     learns_shape: bool,
-    report: Progress,
+    progress: Progress,
+    kept: StageState,
     threads: int,
 ) -> Registered:
     """As :func:`register`; frames are shared out among threads, all else is done by one."""
@@ -209,39 +229,86 @@ def _register(
         shared=shared,
         threads=threads,
     )
-    for outlier in (_WIDE, _MIDDLE) if options.is_wide else (_MIDDLE,):
-        descent.step_poses(Look(_FINE, outlier), 4)
-    report(0.15)
-    descent.step_shape(Look(_FINE, _MIDDLE), 4)
-    report(0.2)
-    for degrees in options.tilts:
-        begin_tilted(descent, Look(_FINE, _NARROW), degrees)
-        begin_like_neighbours(descent, Look(_FINE, _NARROW))
-        descent.step_shape(Look(_FINE, _NARROW), 2)
-    report(0.35)
-    for turn in range(options.restarts):
-        begin_anew(descent, Look(_FINE, _NARROW), generator, is_near=turn % 2 == 1)
-    if has_landmarks:
-        begin_at_landmarks(descent, Look(_FINE, _NARROW))
-    report(0.45)
-    descent.step_shape(Look(_FINE, _NARROW), 4)
-    if is_learned:
-        for _ in range(3):
-            error = _learned_error(descent, Look(_FINE, _NARROW), error)
-            descent.information = _information(error, len(observations))
-            descent.damping.fill_(1e-2)
-            descent.step_shape(Look(_FINE, _NARROW), 2)
-            descent.step_poses(Look(_FINE, _NARROW), 2)
-    report(0.55)
-    look = Look(_FINE, _NARROW)
+    outlines, look = Look(_FINE, _NARROW), Look(_FINE, _NARROW)
     width = observations[0].picture.camera.width / 256
-    for number, sigma in enumerate(options.texture_sigmas):
-        descent.forget_bands(look.sigma)
-        for turn in range(options.texture_rounds):
-            look = textured_look(descent, sigma * width)
-            descent.step_poses(look, 2)
-            done = number + (turn + 1) / options.texture_rounds
-            report(0.55 + 0.45 * done / len(options.texture_sigmas))
+
+    def begin() -> None:
+        for outlier in (_WIDE, _MIDDLE) if options.is_wide else (_MIDDLE,):
+            descent.step_poses(Look(_FINE, outlier), 4)
+
+    def tilt(degrees: float) -> None:
+        begin_tilted(descent, outlines, degrees)
+        begin_like_neighbours(descent, outlines)
+        descent.step_shape(outlines, 2)
+
+    def learn_error() -> None:
+        nonlocal error
+        error = _learned_error(descent, outlines, error)
+        descent.information = _information(error, len(observations))
+        descent.damping.fill_(1e-2)
+        descent.step_shape(outlines, 2)
+        descent.step_poses(outlines, 2)
+
+    def draw_to_texture(sigma: float) -> None:
+        nonlocal look
+        descent.forget_bands(_FINE)
+        for other in options.texture_sigmas:
+            if other != sigma:
+                descent.forget_bands(other * width)
+        look = textured_look(descent, sigma * width)
+        descent.step_poses(look, 2)
+
+    # What is done, one piece after the other, and about how long each takes beside the others.
+    pieces: list[tuple[float, Callable[[], None]]] = [(15.0, begin)]
+    pieces.append((5.0, lambda: descent.step_shape(Look(_FINE, _MIDDLE), 4)))
+    pieces += [(15.0, partial(tilt, degrees)) for degrees in options.tilts]
+    pieces += [
+        (2.5, partial(begin_anew, descent, outlines, generator, is_near=turn % 2 == 1))
+        for turn in range(options.restarts)
+    ]
+    if has_landmarks:
+        pieces.append((10.0, lambda: begin_at_landmarks(descent, outlines)))
+    pieces.append((5.0, lambda: descent.step_shape(outlines, 4)))
+    pieces += [(3.0, learn_error)] * (3 if is_learned else 0)
+    rounds = len(options.texture_sigmas) * options.texture_rounds
+    for sigma in options.texture_sigmas:
+        pieces += [(45.0 / rounds, partial(draw_to_texture, sigma))] * options.texture_rounds
+    total = sum(seconds for seconds, _ in pieces)
+    done = 0
+
+    def state() -> WorkState:
+        return WorkState(
+            {
+                "rotations": descent.poses.rotations,
+                "translation": descent.poses.translation,
+                "shared": descent.shared,
+                "damping": descent.damping.clone(),
+                "information": descent.information,
+                "generator": generator.get_state(),
+            },
+            {"done": done, "error": error, "shared_damping": descent.shared_damping},
+        )
+
+    if (begun := kept.read()) is not None:
+        descent.poses = HandPose(begun.tensors["rotations"], begun.tensors["translation"])
+        descent.shared = begun.tensors["shared"]
+        descent.damping = begun.tensors["damping"]
+        descent.information = begun.tensors["information"]
+        descent.shared_damping = float(begun.facts["shared_damping"])
+        generator.set_state(begun.tensors["generator"])
+        done, error = int(begun.facts["done"]), float(begun.facts["error"])
+    passed = sum(seconds for seconds, _ in pieces[:done])
+    progress.skip(passed, total)
+    before = state()
+    # Of a piece that is broken off nothing is kept; the last one finds the texture for the end.
+    with kept.kept(lambda: before) as now_and_then:
+        for seconds, piece in pieces[done:]:
+            piece()
+            done, passed = done + 1, passed + seconds
+            if done < len(pieces):
+                before = state()
+                now_and_then()
+            progress(passed / total)
     energies, covariances = descent.judge(look)
     return Registered(
         descent.poses,

@@ -30,6 +30,8 @@ _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e4
 _LONGEST_TURN = 0.35
 """Radians of one step."""
 _FURTHER, _BACK = 0.25, 6.0
+_MOST_BAND_BYTES = 512 * 2**20
+"""Of the bands that are kept; a picture 256 wide has 1 MB a band."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,11 +109,14 @@ class Descent:
         return selected
 
     def band(self, frame: int, sigma: float) -> PictureBand:
-        """A band of a frame's picture; kept."""
+        """A band of a frame's picture; kept, unless those of very many frames are already."""
         key = (frame, sigma)
-        if key not in self._bands:
-            self._bands[key] = self.observations[frame].picture.band(sigma)
-        return self._bands[key]
+        if (kept := self._bands.get(key)) is not None:
+            return kept
+        band = self.observations[frame].picture.band(sigma)
+        if (len(self._bands) + 1) * band.channels.nbytes <= _MOST_BAND_BYTES:
+            self._bands[key] = band
+        return band
 
     def forget_bands(self, sigma: float) -> None:
         """Frees what belongs to one blur."""

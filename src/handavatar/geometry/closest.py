@@ -11,6 +11,8 @@ from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from handavatar.errors import HandAvatarError
+
 _PAIRS_AT_ONCE = 1 << 19
 
 
@@ -76,14 +78,14 @@ def closest_on_mesh(
     best found: middles are at most the largest face's radius from any of its points.
 
     Raises:
-        ValueError: if there is no face, or a coordinate is not finite.
+        HandAvatarError: if there is no face, or a coordinate is not finite.
     """
     if len(faces) == 0:
-        raise ValueError("cannot measure distances to a mesh without faces")
+        raise HandAvatarError("cannot measure distances to a mesh without faces")
     for name, values in (("vertices", vertices), ("points", points)):
         bad = int((~torch.isfinite(values)).any(-1).sum())
         if bad:
-            raise ValueError(
+            raise HandAvatarError(
                 f"cannot measure distances: {bad} of {len(values)} {name} hold NaN or infinity; "
                 "expected finite metres"
             )

@@ -16,6 +16,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from handavatar.errors import HandAvatarError
+
 Field = Callable[[Float[Tensor, "points 3"]], Float[Tensor, "points"]]
 """A value at each point in metres, greater inside."""
 
@@ -97,7 +99,7 @@ def extract_surface(
     """
     sides = (upper - lower).double().cpu().numpy()
     if resolution < 2 or not (np.isfinite(sides).all() and (sides > 0).all()):
-        raise ValueError(
+        raise HandAvatarError(
             f"extraction: found a box with sides {sides.tolist()} m and resolution {resolution}; "
             "expected positive sides and at least 2 cells"
         )
@@ -288,7 +290,7 @@ class _Grid:
             values = self.values_of(points).double().cpu().numpy()
             if np.isnan(values).any():
                 where = points[int(np.isnan(values).argmax())].tolist()
-                raise ValueError(
+                raise HandAvatarError(
                     f"extraction: the field answers NaN at {where} m, and at "
                     f"{int(np.isnan(values).sum())} of {len(values)} points; expected numbers: "
                     "check the weights and the posed vertices for NaN"

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from handavatar.errors import HandAvatarError
 from handavatar.geometry.closest import closest_on_mesh
 
 
@@ -122,15 +123,15 @@ def boundary_loop(faces: Int[Tensor, "faces 3"]) -> Int[Tensor, "rim"]:
     directed = {(int(a), int(b)) for a, b in half_edges}
     following = {a: b for a, b in directed if (b, a) not in directed}
     if not following:
-        raise ValueError("the mesh has no boundary: expected one open loop at the wrist")
+        raise HandAvatarError("the mesh has no boundary: expected one open loop at the wrist")
     start = min(following)
     loop = [start]
     while following[loop[-1]] != start:
         loop.append(following[loop[-1]])
         if len(loop) > len(following) or loop[-1] not in following:
-            raise ValueError("the boundary of the mesh is not a simple loop")
+            raise HandAvatarError("the boundary of the mesh is not a simple loop")
     if len(loop) != len(following):
-        raise ValueError(
+        raise HandAvatarError(
             f"the mesh has more than one boundary: {len(following)} rim edges, "
             f"{len(loop)} of them in the first loop"
         )
@@ -176,7 +177,7 @@ def sample_surface(
     """
     area = face_cross_products(vertices, faces).norm(dim=-1)
     if not float(area.detach().sum()) > 0:
-        raise ValueError(f"cannot sample {count} points on {len(faces)} faces without area")
+        raise HandAvatarError(f"cannot sample {count} points on {len(faces)} faces without area")
     chosen = torch.multinomial(area.double(), count, replacement=True, generator=generator)
     u = torch.rand(count, 2, generator=generator, dtype=vertices.dtype)
     root = u[:, :1].sqrt()

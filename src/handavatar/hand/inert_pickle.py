@@ -13,6 +13,8 @@ import struct
 from dataclasses import dataclass
 from typing import Any
 
+from handavatar.errors import HandAvatarError
+
 MAX_INSTRUCTIONS = 20_000
 """A MANO file has a few hundred."""
 _MAX_INTEGER_BYTES = 16
@@ -50,7 +52,7 @@ _ESCAPED = re.compile(
 _INDEX_SIZES = {b"h": 1, b"j": 4, b"q": 1, b"r": 4}
 
 
-class PickleError(ValueError):
+class PickleError(HandAvatarError):
     """A pickle that is refused or damaged: what was found in it."""
 
 

@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from handavatar.errors import ArgumentError
 from handavatar.geometry.meshes import unique_edges
 from handavatar.geometry.rotations import (
     axis_angle_from_matrix,
@@ -441,10 +442,10 @@ def gesture_rotations(rig: Rig, name: str) -> Float[Tensor, "bones 3"]:
     """Axis-angle rotations of a named gesture.
 
     Raises:
-        ValueError: unknown name.
+        ArgumentError: unknown name.
     """
     if name not in GESTURES:
-        raise ValueError(f"gesture: found {name!r}, expected one of {sorted(GESTURES)}")
+        raise ArgumentError("name", repr(name), f"one of {sorted(GESTURES)}")
     return rotations_from_angles(rig, GESTURES[name].angles())
 
 

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from handavatar.errors import ErrorKind, HandAvatarError
 from handavatar.geometry.meshes import boundary_loop
 from handavatar.hand.pose import NUM_BONES, HandPose, bone_transforms, linear_blend_skinning
 from handavatar.hand.pose_features import NUM_POSE_FEATURES, pose_features
@@ -31,12 +32,14 @@ RIG_ARRAYS = (
 """What every rig has; files of rigs and avatars store these by name."""
 
 
-class RigError(ValueError):
+class RigError(HandAvatarError):
     """A rig that cannot be used: what was found, what was expected, what to do."""
 
 
 class LicensedRigMissing(RigError):
     """A rig that may not ship and is not here: which, and where to get it."""
+
+    kind = ErrorKind.LICENSED_FILE_MISSING
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,9 +11,11 @@ from pathlib import Path
 from safetensors import SafetensorError
 from safetensors import torch as safetensors_torch
 
+from handavatar.errors import raise_if_refused
 from handavatar.hand.mano import LICENCE, WHERE_TO_GET_IT, ManoModel, read_mano
 from handavatar.hand.open_hand import Level, load_open_hand
 from handavatar.hand.rig import RIG_ARRAYS, LicensedRigMissing, Rig, RigError
+from handavatar.jobs.files import refuse_file_in_use, write_atomically
 
 SCHEMA = 1
 _MAX_BYTES = 64 * 2**20
@@ -39,14 +41,13 @@ def save_rig(model: ManoModel, path: Path | None = None, overwrite: bool = False
         The file.
 
     Raises:
-        RigError: there is a file at ``path`` already.
+        FolderInUse: there is a file at ``path`` already.
     """
     rig = model.rig
     if path is None:
         path = rigs_folder() / f"{rig.name}-{rig.sha256[:12]}.safetensors"
         overwrite = True  # Its name says that it holds the same.
-    if path.exists() and not (overwrite and path.is_file()):
-        raise RigError(f"{path}: exists already\nname another file, or add --overwrite")
+    refuse_file_in_use(path, overwrite)
     tensors = {name: getattr(rig, name).contiguous() for name in _TENSORS}
     tensors |= {_SET_PREFIX + name: members for name, members in rig.vertex_sets.items()}
     tensors |= {"hands_mean": model.hands_mean, "hands_components": model.hands_components}
@@ -59,13 +60,7 @@ def save_rig(model: ManoModel, path: Path | None = None, overwrite: bool = False
         "licence": LICENCE,
         "source_sha256": model.sha256,
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    aside = path.with_name(f".tmp-{os.getpid()}-{path.name}")
-    try:
-        safetensors_torch.save_file(tensors, aside, facts)
-        aside.replace(path)
-    finally:
-        aside.unlink(missing_ok=True)
+    write_atomically({path: safetensors_torch.save(tensors, facts)})
     return path
 
 
@@ -92,6 +87,7 @@ def read_rig(path: Path) -> Rig:
             **{name: arrays[name] for name in _TENSORS},
         )
     except (KeyError, OSError, SafetensorError, RigError, RuntimeError) as error:
+        raise_if_refused(error)
         raise RigError(f"{path}: not a whole rig ({error})\nimport it again") from error
     if rig.sha256 != facts["sha256"]:
         raise RigError(
@@ -120,8 +116,9 @@ def load_rig(reference: str, level: Level = "full") -> Rig:
         return load_open_hand("778")
     if level != "full":
         raise RigError(
-            f"rig {reference[:80]}: found level {level}, which the open hand alone has\n"
-            "leave out --level: other rigs are used as they are"
+            f"rig {reference[:80]}: found level {level}, which the open hand alone has",
+            "",
+            "leave out `level`: other rigs are used as they are",
         )
     path = Path(reference)
     if path.suffix == ".pkl":
@@ -178,8 +175,9 @@ def _named(reference: str) -> Path:
         )
     if not named:
         raise LicensedRigMissing(
-            f"rig {reference[:80]}: not imported; {rigs_folder()} does not hold it\n"
-            f"{WHERE_TO_GET_IT}"
+            f"rig {reference[:80]}: not imported; {rigs_folder()} does not hold it",
+            "",
+            f"{WHERE_TO_GET_IT}",
         )
     return named[0]
 
@@ -203,8 +201,9 @@ def find_rig(sha256: str, name: str) -> Rig:
             return read_rig(path)
     if name.startswith("mano"):
         raise LicensedRigMissing(
-            f"rig {name} ({sha256[:12]}): not imported; {rigs_folder()} does not hold it\n"
-            f"{WHERE_TO_GET_IT}"
+            f"rig {name} ({sha256[:12]}): not imported; {rigs_folder()} does not hold it",
+            "",
+            f"{WHERE_TO_GET_IT}",
         )
     raise RigError(
         f"rig {name} ({sha256[:12]}): unknown; the open hand of this version is "

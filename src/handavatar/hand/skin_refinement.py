@@ -13,9 +13,10 @@ from pathlib import Path
 import torch
 from jaxtyping import Bool, Float, Int
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
+from handavatar.errors import SEEDS, raise_if_refused, require_ranges
 from handavatar.geometry.closest import closest_on_mesh
 from handavatar.geometry.meshes import uniform_laplacian_matrix, unique_edges
 from handavatar.geometry.rotations import (
@@ -28,11 +29,12 @@ from handavatar.hand.pose import FINGER_BONES, bone_transforms
 from handavatar.hand.pose_sampling import sample_poses
 from handavatar.hand.rig import Rig, RigError
 from handavatar.hand.sparse_skin import MAX_BONES
+from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import require_finite
 
 SHARPNESS = 100.0
 """The paper's eta: a weight of 0.01 counts as 63 % of a bone."""
-_BEGIN_ANEW = "begin anew with another --seed or a lower --lr, and without --resume"
+_BEGIN_ANEW = "begin anew with another `seed` or a lower `lr`, and without `resume=True`"
 # Decay of the running means of the gradient and of its square.
 _MOMENTUM, _SCALE = 0.9, 0.99
 
@@ -77,6 +79,22 @@ class RefinementOptions:
     is_local: bool = True
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            steps=(0, 10**7),
+            refit_steps=(0, 10**7),
+            poses=(1, 1000),
+            surface_points=(1, 10**6),
+            smoothness=(0, 1e6),
+            surface=(0, 1e6),
+            sparsity=(0, 1e6),
+            lr=(1e-12, 1),
+            final_lr=(1e-12, 1),
+            seed=SEEDS,
+        )
+
 
 @dataclass(frozen=True, eq=False)
 class RefinementState:
@@ -107,10 +125,8 @@ class RefinementState:
         require_finite(vars(self), f"{path}: not saved", _BEGIN_ANEW)
         # A tensor that is two of the fields at once is stored twice.
         tensors = {name: value.clone() for name, value in vars(self).items() if name != "step"}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside = path.with_name(path.name + ".tmp")
-        save_file(tensors, aside, {"step": str(self.step), "problem": problem.fingerprint})
-        aside.replace(path)
+        facts = {"step": str(self.step), "problem": problem.fingerprint}
+        write_atomically({path: save(tensors, facts)})
 
     @staticmethod
     def load(path: Path, problem: "SkinRefinement") -> "RefinementState":
@@ -126,6 +142,7 @@ class RefinementState:
             require_finite(tensors, "state")
             state = RefinementState(step=int(header["step"]), **tensors)
         except Exception as error:
+            raise_if_refused(error)
             raise RigError(
                 f"{path}: cannot be continued ({error}); delete it and begin anew"
             ) from error
@@ -442,14 +459,14 @@ class SkinRefinement:
 def refine_skin(
     problem: SkinRefinement,
     state: RefinementState | None = None,
-    report: Callable[[RefinementState, dict[str, float]], None] | None = None,
+    after_step: Callable[[RefinementState, dict[str, float]], None] | None = None,
 ) -> RefinedWeights:
     """Refines the weights of a subdivided rig.
 
     Args:
         problem: rig and options.
         state: where to continue; the beginning by default.
-        report: called after every step.
+        after_step: is given every state and its figures.
 
     Raises:
         NotFinite: if a weight or what moves it is no longer finite.
@@ -460,6 +477,6 @@ def refine_skin(
     state = problem.begin() if state is None else state
     while state.step < problem.total_steps:
         state, figures = problem.advanced(state)
-        if report is not None:
-            report(state, figures)
+        if after_step is not None:
+            after_step(state, figures)
     return problem.result(state)

@@ -6,11 +6,13 @@ from pathlib import Path
 import torch
 from jaxtyping import Bool, Float, Int
 from safetensors import safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
+from handavatar.errors import raise_if_refused
 from handavatar.hand.pose import NUM_BONES
 from handavatar.hand.rig import Rig, RigError
+from handavatar.jobs.files import write_atomically
 
 MAX_BONES = 4
 """Bones that may move one vertex: game engines and glTF's first joint set allow no more."""
@@ -80,11 +82,8 @@ class SparseSkin:
             facts: what else its header says, such as how the weights were made.
         """
         header = {"schema": SCHEMA, "rig_sha256": self.rig_sha256, "rounds": str(self.rounds)}
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside = path.with_name(path.name + ".tmp")
         tensors = {"bones": self.bones.to(torch.uint8), "shares": self.shares.to(torch.uint16)}
-        save_file(tensors, aside, (facts or {}) | header)
-        aside.replace(path)
+        write_atomically({path: save(tensors, (facts or {}) | header)})
 
     @staticmethod
     def load(path: Path) -> "SparseSkin":
@@ -104,6 +103,7 @@ class SparseSkin:
             )
             is_sound: Bool[Tensor, ""] = (skin.shares.sum(-1) == _WHOLE).all()
         except Exception as error:
+            raise_if_refused(error)
             raise RigError(
                 f"{path}: cannot be read as skin weights ({error}); make them again with "
                 "`handavatar rig refine`"

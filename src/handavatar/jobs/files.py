@@ -9,12 +9,17 @@ stays, and the same command given again does only the rest.
 """
 
 import contextlib
+import ctypes
+import errno
 import fnmatch
 import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+import socket
+import sys
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import count
@@ -22,29 +27,30 @@ from pathlib import Path
 from typing import Any
 
 from handavatar import __version__
+from handavatar.errors import ErrorKind, HandAvatarError
 
 MARKER = ".handavatar"
 """Name of the file that says that, and how, the program made a folder."""
 _MAX_MARKER_BYTES = 64 * 2**20
 _OF_THE_SYSTEM = {".DS_Store", "Thumbs.db", "desktop.ini"}
 _NAMED_STRANGERS = 3
+_KEPT_OF_A_NAME = 40
+_NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}
+"""A file system that keeps nothing says one of these, and it is none's fault."""
+_AT_WORKING_FOLDER, _EXCHANGE = -100, 2
+"""Of ``renameat2``: AT_FDCWD and RENAME_EXCHANGE, as Linux's headers have them."""
 
 _log = logging.getLogger(__name__)
 
 
-class FolderInUse(ValueError):
-    """A place where a folder cannot be written.
+class FolderInUse(HandAvatarError):
+    """A place where a folder cannot be written: what lies there, and what to do about it."""
 
-    Attributes:
-        found: what lies there.
-        remedy: what to do about it.
-    """
+    kind = ErrorKind.USAGE
 
-    def __init__(self, found: str, remedy: str) -> None:
-        """Keeps the two halves apart, for those who have an error of their own."""
-        super().__init__(f"{found}\n{remedy}")
-        self.found = found
-        self.remedy = remedy
+    def __init__(self, found: str, remedy: str = "") -> None:
+        """Nothing else is expected than a place that is free."""
+        super().__init__(found, "", remedy)
 
 
 def _never(folder: Path) -> bool:
@@ -67,19 +73,72 @@ class FolderKind:
     is_older: Callable[[Path], bool] = _never
 
 
-def write_atomically(files: Mapping[Path, bytes]) -> None:
-    """Writes all files aside and then renames them: nothing half written is ever at its place."""
-    pending: dict[Path, Path] = {}
+@contextlib.contextmanager
+def write_aside(path: Path, is_durable: bool = True) -> Iterator[Path]:
+    """Gives the name of a file to be written, which takes its place when the block ends.
+
+    If the block fails, what lay at ``path`` is as it was, and what was written is gone.
+
+    Args:
+        path: of the file; folders above it are made.
+        is_durable: whether the file must outlive a crash of the machine from then on.
+
+    Yields:
+        A name in the same folder, with the same ending.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Of a long name the end alone: the whole would be longer than a name may be.
+    unique = f"{os.getpid()}-{threading.get_ident()}"
+    aside = path.with_name(f".tmp-{unique}-{path.name[-_KEPT_OF_A_NAME:]}")
     try:
-        for path, content in files.items():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            pending[path] = path.with_name(f".tmp-{os.getpid()}-{path.name}")
-            pending[path].write_bytes(content)
-        for path, aside in pending.items():
-            os.replace(aside, path)
+        yield aside
+        if is_durable:
+            _sync(aside)
+        os.replace(aside, path)
+        if is_durable:
+            _sync(path.parent)
     finally:
-        for aside in pending.values():
-            aside.unlink(missing_ok=True)
+        aside.unlink(missing_ok=True)
+
+
+def write_atomically(files: dict[Path, bytes], is_durable: bool = True) -> None:
+    """Writes all files aside, then renames them in this order: nothing half written is in place.
+
+    Args:
+        files: contents by path.
+        is_durable: as of :func:`write_aside`.
+
+    Raises:
+        OSError: if one cannot be written; then none is renamed, unless renaming is what failed.
+    """
+    with contextlib.ExitStack() as stack:
+        for path, content in reversed(files.items()):  # The last to enter is the first to leave.
+            stack.enter_context(write_aside(path, is_durable)).write_bytes(content)
+
+
+def _sync(path: Path) -> None:
+    """Has the disk keep a file, or the names in a folder."""
+    if os.name == "nt":  # which opens no folders, and files for reading only to no avail
+        return
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in _NO_SYNC:
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def _sync_tree(folder: Path) -> None:
+    for top, _, names in os.walk(folder):
+        for name in names:
+            if not (Path(top) / name).is_symlink():
+                _sync(Path(top) / name)
+        _sync(Path(top))
 
 
 # --- the marker -----------------------------------------------------------------------------------
@@ -230,6 +289,24 @@ def files_named(*names: str | Path | None) -> list[Path]:
     return [Path(name) for name in names if name is not None and Path(name).is_file()]
 
 
+def refuse_file_in_use(path: Path, overwrite: bool = False) -> None:
+    """Refuses a place for a new file where something lies.
+
+    Args:
+        path: where the file is to be.
+        overwrite: whether a file, which nothing marks as the program's, may be replaced.
+
+    Raises:
+        FolderInUse: if a file lies there, or something that is none.
+    """
+    if not os.path.lexists(path):
+        return
+    if not path.is_file():
+        raise FolderInUse(f"{path} is no file, expected none or a file", "name another file")
+    if not overwrite:
+        raise FolderInUse(f"{path} exists", "name another file, or use `overwrite=True`")
+
+
 # --- replacing a folder ---------------------------------------------------------------------------
 
 
@@ -267,7 +344,7 @@ def refuse_folder_in_use(
     if is_empty(target):
         return
     if not overwrite:
-        raise FolderInUse(f"{target}: not empty", "name another folder, or use --overwrite")
+        raise FolderInUse(f"{target}: not empty", "name another folder, or use `overwrite=True`")
     marker = read_marker(target)
     if not kind.is_older(target) if marker is None else marker["kind"] != kind.name:
         raise FolderInUse(
@@ -292,8 +369,10 @@ def swap_folder(
 ) -> None:
     """Puts a whole folder where it belongs; what it replaces is removed when it is in place.
 
-    Two renames: the old folder takes a hidden name beside, the new one its place. If that fails
-    the old one is put back. A process killed between the two leaves both, whole.
+    The two exchange their names in one step: at every moment the old or the new folder is at its
+    place. Where the system cannot do that (only Linux can), the old one takes a hidden name beside
+    and the new one its place; if that fails the old one is put back, and a process that is killed
+    between the two leaves both, whole, for :func:`restore_folder`.
 
     Args:
         whole: folder on the same disk as ``target``, with its marker.
@@ -308,16 +387,18 @@ def swap_folder(
     target = _absolute(target)
     refuse_folder_in_use(target, kind, overwrite, inputs)
     if is_empty(target):
+        _sync_tree(whole)
         os.rename(whole, target)
+        _sync(target.parent)
         return
     if read_marker(target) is None:
         mark_folder(target, kind)
-    old = _hidden_name(target)
-    os.rename(target, old)
+    hidden = _hidden_name(target)
+    os.rename(whole, hidden)
     try:
-        os.rename(whole, target)
+        put_in_place(hidden, target)
     except BaseException:
-        os.rename(old, target)
+        os.rename(hidden, whole)
         raise
     for left in _hidden_folders(target):
         try:
@@ -327,6 +408,48 @@ def swap_folder(
                 left.rmdir()
         except OSError as error:
             _log.warning("%s: replaced, but cannot be removed (%s)", left, error)
+
+
+def put_in_place(whole: Path, target: Path) -> None:
+    """Gives a whole folder its place, kept by the disk; what lay there is left beside, hidden.
+
+    Args:
+        whole: folder on the same disk, of a hidden name. A folder that it replaces has this name
+            afterwards, or this one, ``-old`` and a number.
+        target: an empty place, or a folder.
+
+    Raises:
+        OSError: if it cannot be; then all is as it was.
+    """
+    _sync_tree(whole)
+    if not target.exists():
+        os.rename(whole, target)
+    elif not _exchange(whole, target):
+        old = _free_number(whole.with_name(f"{whole.name}-old"))
+        os.rename(target, old)
+        try:
+            os.rename(whole, target)
+        except BaseException:
+            os.rename(old, target)
+            raise
+    _sync(target.parent)
+
+
+def _exchange(first: Path, second: Path) -> bool:
+    """Lets two folders exchange their names in one step; False where the system cannot."""
+    if sys.platform != "linux":
+        return False
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if rename is None:
+        return False
+    here = ctypes.c_int(_AT_WORKING_FOLDER)
+    names = os.fsencode(first), os.fsencode(second)
+    if rename(here, names[0], here, names[1], ctypes.c_uint(_EXCHANGE)) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP):
+        return False
+    raise OSError(code, os.strerror(code), str(second))
 
 
 def restore_folder(target: Path) -> None:
@@ -359,10 +482,19 @@ def remove_folder(folder: Path) -> None:
 
 
 def _hidden_name(target: Path) -> Path:
+    return _free_name(target, "replaced")
+
+
+def _free_name(target: Path, what: str) -> Path:
+    return _free_number(target.with_name(f".{target.name}.{what}-{os.getpid()}"))
+
+
+def _free_number(begin: Path) -> Path:
+    """The first name that is free of those that begin so."""
     for number in count():
-        old = target.with_name(f".{target.name}.replaced-{os.getpid()}-{number}")
-        if not os.path.lexists(old):
-            return old
+        name = begin.with_name(f"{begin.name}-{number}")
+        if not os.path.lexists(name):
+            return name
     raise AssertionError("there is always a number that is free")
 
 
@@ -405,6 +537,78 @@ def _listed(names: list[str]) -> str:
     shown = ", ".join(_printable(name) for name in names[:_NAMED_STRANGERS])
     more = len(names) - _NAMED_STRANGERS
     return f"{shown} and {more} more" if more > 0 else shown
+
+
+# --- folders that are made at once ----------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def fill_folder(
+    target: Path,
+    kind: FolderKind,
+    overwrite: bool = False,
+    inputs: Iterable[Path] = (),
+) -> Iterator[Path]:
+    """Gives a folder to be filled, which takes its place when the block ends, marked and whole.
+
+    If the block fails, what was there before is as it was, and what was written is gone. What
+    killed processes of this machine have left is removed.
+
+    Args:
+        target: as in :func:`refuse_folder_in_use`, and so are the others.
+        kind: what it will be.
+        overwrite: whether a folder of the same kind may be replaced.
+        inputs: what the target may not hold.
+
+    Yields:
+        An empty folder beside ``target``, with the marker.
+
+    Raises:
+        FolderInUse: as :func:`refuse_folder_in_use`; before the block, and after it if something
+            has come meanwhile.
+        OSError: if it cannot be made.
+    """
+    target = _absolute(target)
+    inputs = tuple(inputs)
+    restore_folder(target)
+    refuse_folder_in_use(target, kind, overwrite, inputs)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    _remove_abandoned(target, kind)
+    aside = _free_name(target, "unfinished")
+    aside.mkdir()
+    try:
+        mark_folder(aside, kind, {"process": os.getpid(), "host": socket.gethostname()})
+        yield aside
+        mark_folder(aside, kind)
+        name_files(aside)
+        swap_folder(aside, target, kind, overwrite, inputs)
+    finally:
+        shutil.rmtree(aside, ignore_errors=True)
+
+
+def _remove_abandoned(target: Path, kind: FolderKind) -> None:
+    """Removes what killed processes have left of :func:`fill_folder`."""
+    begin = f".{target.name}.unfinished-"
+    for path in target.parent.iterdir():
+        if path.name.startswith(begin) and path.is_dir() and not path.is_symlink():
+            marker = read_marker(path) or {}
+            is_ours = marker.get("kind") == kind.name and marker.get("host") == socket.gethostname()
+            process = marker.get("process")
+            if is_ours and isinstance(process, int) and not _is_running(process):
+                remove_folder(path)  # One killed before it could mark its folder leaves it empty.
+
+
+def _is_running(process: int) -> bool:
+    """Whether a process of this machine is there; where nobody can tell, it is."""
+    if os.name == "nt" or process <= 0:
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        return True
+    return True
 
 
 # --- folders that fill slowly ---------------------------------------------------------------------
@@ -485,7 +689,7 @@ class UnfinishedFolder:
 
     def write(self, name: str, content: bytes) -> None:
         """Writes one file aside and renames it into place."""
-        write_atomically({self.path / name: content})
+        write_atomically({self.path / name: content}, is_durable=False)
 
     def finish(self) -> None:
         """Takes the target's place; one process alone, when all is there.

@@ -10,22 +10,19 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from handavatar.errors import ErrorKind, HandAvatarError
+
 _LONGEST_NAME = 120
 
 
-class NotFinite(FloatingPointError):
-    """NaN or infinity where numbers are expected.
+class NotFinite(HandAvatarError, FloatingPointError):
+    """NaN or infinity where numbers are expected: what holds it, where, and what to do about it."""
 
-    Attributes:
-        found: what holds it, and where.
-        remedy: what to do about it; empty where only the caller knows.
-    """
+    kind = ErrorKind.NUMERICAL
 
     def __init__(self, found: str, remedy: str = "") -> None:
-        """Keeps the two halves apart: who knows the remedy is often not who finds it."""
-        super().__init__(f"{found}\n{remedy}" if remedy else found)
-        self.found = found
-        self.remedy = remedy
+        """The remedy is empty where only the caller knows."""
+        super().__init__(found, "", remedy)
 
 
 def find_not_finite(values: Mapping[str, object]) -> str | None:

@@ -5,6 +5,8 @@ operations on such pieces too finely to gain anything. Pieces are independent, s
 not depend on the number of threads.
 """
 
+import os
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -13,35 +15,66 @@ from typing import TypeVar
 
 import torch
 
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.signals import heed, heeds, stop_point
+
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 
 
+def step_back(steps: int) -> None:
+    """Leaves the cores to other threads, on Linux: elsewhere a priority is the whole process's.
+
+    Args:
+        steps: of the thread's priority, as of ``nice``; each adds to the last.
+    """
+    if sys.platform == "linux":
+        os.nice(steps)
+
+
 def mapped(
-    function: Callable[[Piece], Result], pieces: Iterable[Piece], count: int | None = None
+    function: Callable[[Piece], Result],
+    pieces: Iterable[Piece],
+    count: int | None = None,
+    progress: Progress = SILENT,
 ) -> list[Result]:
-    """``function`` of every piece, in order, without gradient.
+    """``function`` of every piece, in order, without gradient; each begins at a stop point.
 
     Args:
         function: of one piece.
         pieces: of the work.
         count: of threads; by default as many as torch has.
+        progress: told how many pieces are done.
+
+    Raises:
+        Interrupted: if the command was told to stop.
     """
+    does_heed = heeds()
 
     def without_gradient(piece: Piece) -> Result:
         # Gradient mode and inner threads belong to the thread, not to the process.
         torch.set_num_threads(1)
+        heed(does_heed)
+        stop_point()
         with torch.no_grad():
             return function(piece)
 
     work = list(pieces)
     before = torch.get_num_threads()
     count = before if count is None else count
+    results: list[Result] = []
     if count == 1 or len(work) == 1:
         with torch.no_grad():
-            return [function(piece) for piece in work]
+            for piece in work:
+                stop_point()
+                results.append(function(piece))
+                progress(len(results), len(work))
+        return results
     try:
-        return list(_pool(count).map(without_gradient, work))
+        for result in _pool(count).map(without_gradient, work):
+            results.append(result)
+            progress(len(results), len(work))
+        return results
     finally:
         torch.set_num_threads(before)
 

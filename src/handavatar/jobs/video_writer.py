@@ -1,14 +1,18 @@
 """Writing films that every player opens and shows in the same colours."""
 
+import contextlib
 import platform
 from fractions import Fraction
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import av
 import numpy as np
 from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import UInt8
+
+from handavatar.jobs.files import write_aside
 
 # Of ITU-T H.273: matrix, primaries and transfer alike.
 _BT709 = 1
@@ -20,9 +24,10 @@ _SAME_EVERYWHERE: dict[str, object] = (
 
 
 class VideoWriter:
-    """Writes RGB pictures into an H.264 film that is BT.709 and says so.
+    """Writes RGB pictures into an H.264 film that is BT.709 and says so; used in a ``with`` block.
 
-    The same pictures give the same film, bit by bit.
+    The film is at its place when the block ends, whole. The same pictures give the same film, bit
+    by bit.
     """
 
     def __init__(
@@ -37,8 +42,9 @@ class VideoWriter:
             width: of a picture that is no square, which then is ``size`` high.
             crf: constant rate factor: smaller is nearer to the pictures.
         """
+        self._whole = contextlib.ExitStack()
         self._height, self._width = size // 2 * 2, (width or size) // 2 * 2
-        self._container = av.open(str(path), "w")
+        self._container = av.open(str(self._whole.enter_context(write_aside(path))), "w")
         rate = Fraction(fps).limit_denominator(1000)
         self._stream: Any = self._container.add_stream("libx264", rate=rate)
         self._stream.width, self._stream.height = self._width, self._height
@@ -53,9 +59,21 @@ class VideoWriter:
         """Itself."""
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Finishes the file."""
-        self.close()
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Puts the whole film in place; if the block failed, nothing of it stays."""
+        try:
+            if error is None:
+                self._container.mux(self._stream.encode())
+            self._container.close()
+        except BaseException as failure:
+            self._whole.__exit__(type(failure), failure, failure.__traceback__)
+            raise
+        self._whole.__exit__(kind, error, traceback)
 
     def add(self, pixels: UInt8[np.ndarray, "height width 3"]) -> None:
         """Adds one picture, sRGB."""
@@ -64,8 +82,3 @@ class VideoWriter:
             format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
         )
         self._container.mux(self._stream.encode(frame))
-
-    def close(self) -> None:
-        """Finishes the file."""
-        self._container.mux(self._stream.encode())
-        self._container.close()

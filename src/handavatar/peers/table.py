@@ -12,10 +12,12 @@ from torch import Tensor
 
 from handavatar.avatar import RenderSettings
 from handavatar.capture.frames import Frame, read_capture
+from handavatar.errors import SEEDS, require_ranges
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable, step_counter
 from handavatar.evaluate.textured_mesh import RAYS, fit_textured_mesh
 from handavatar.jobs.files import make_folder
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.peers.inverse_skinning import fit_inverse_skinning
 from handavatar.train.ablation import (
     ROWS,
@@ -59,27 +61,29 @@ class PeersTableOptions:
     peer_steps: int = 600
     any_commit: bool = False
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, seeds=SEEDS, steps=(1, 10**8), peer_steps=(1, 10**8))
+
     @property
     def total_steps(self) -> int:
         """Rows and seeds of all captures."""
         return (len(OURS) + len(PEERS)) * len(self.seeds) * len(self.captures)
 
 
-def peers_table(
-    options: PeersTableOptions, report: Callable[[int], None] | None = None
-) -> ResultTable:
+def peers_table(options: PeersTableOptions, progress: Progress = SILENT) -> ResultTable:
     """Fits everything to every capture, and judges the frames that none has seen.
 
     Args:
         options: what to compare.
-        report: told the number of trainings done.
+        progress: told the number of trainings done.
 
     Raises:
         CaptureError: if a capture is damaged, or what is kept is of another capture or commit.
 
     Source: paper Sec. 4.3, comparison with prior art.
     """
-    finished = step_counter(report)
+    finished = step_counter(progress, options.total_steps)
     measured: list[dict[str, Any]] = []
     about = {
         "seeds": list(options.seeds),

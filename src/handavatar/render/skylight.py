@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from handavatar.errors import ArgumentError
 from handavatar.geometry.cameras import look_at
 from handavatar.render.rasterize import rasterize_projected
 
@@ -31,7 +32,7 @@ def even_directions(count: int) -> Float[Tensor, "count 3"]:
         ValueError: if there is to be none.
     """
     if count < 1:
-        raise ValueError(f"even_directions: found {count}, expected at least 1")
+        raise ArgumentError("count", str(count), "at least 1")
     number = torch.arange(count, dtype=torch.float64) + 0.5
     height = 1 - 2 * number / count
     turn = number * math.pi * (3 - math.sqrt(5))

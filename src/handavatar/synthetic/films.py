@@ -7,7 +7,6 @@ truth lies beside the video, see :mod:`handavatar.synthetic.truth`.
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -15,13 +14,13 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from safetensors.torch import save_file
+from safetensors.torch import save
 from scipy import ndimage
 from torch import Tensor
 
-from handavatar.capture.checks import CaptureError
 from handavatar.capture.motion import MOTIONS, Motion, gesture, placed
 from handavatar.capture.synthetic import SynthOptions, make_subject
+from handavatar.errors import require_ranges
 from handavatar.geometry.cameras import Camera, project
 from handavatar.geometry.colors import srgb_from_linear
 from handavatar.geometry.rotations import (
@@ -38,6 +37,8 @@ from handavatar.hand.pose_sampling import (
 )
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.files import write_atomically
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.video_writer import VideoWriter
 from handavatar.render.rasterize import rasterize_projected
 from handavatar.synthetic.actor import Actor, Lights, PosedActor, draw_lights
@@ -103,19 +104,14 @@ class FilmOptions:
 
     def __post_init__(self) -> None:
         """Refuses what cannot be made."""
-        limits = {
-            "width": (96, 1920),
-            "height": (96, 1920),
-            "seconds": (0.5, 60),
-            "fps": (1, 120),
-            "shutter": (0, 1),
-        }
-        for name, (least, most) in limits.items():
-            if not least <= getattr(self, name) <= most:
-                raise CaptureError(
-                    f"{name} is {getattr(self, name)}, expected {least} to {most}",
-                    "choose a value between",
-                )
+        require_ranges(
+            self,
+            width=(96, 1920),
+            height=(96, 1920),
+            seconds=(0.5, 60),
+            fps=(1, 120),
+            shutter=(0, 1),
+        )
 
     @property
     def num_frames(self) -> int:
@@ -190,15 +186,13 @@ FILMS: tuple[FilmOptions, ...] = (
 """The films of ``handavatar bench --table registration``."""
 
 
-def make_film(
-    options: FilmOptions, folder: Path, report: Callable[[int], None] = lambda done: None
-) -> Path:
+def make_film(options: FilmOptions, folder: Path, progress: Progress = SILENT) -> Path:
     """Renders a film and its truth.
 
     Args:
         options: which.
         folder: where ``NAME.mp4``, ``NAME.json`` and ``NAME.safetensors`` are to be.
-        report: told the number of pictures that are done.
+        progress: told the number of pictures that are done.
 
     Returns:
         The path of the video.
@@ -212,14 +206,20 @@ def make_film(
     base = load_rig(options.rig)
     stage = _Stage(options, base)
     masks = []
-    # The video last: who finds it finds the truth as well.
-    aside = folder / f".{options.name}.part.mp4"
-    with VideoWriter(aside, options.fps, options.height, options.width, options.crf) as recorder:
+    with VideoWriter(path, options.fps, options.height, options.width, options.crf) as recorder:
         for frame in range(options.num_frames):
             picture, mask = stage.frame(frame)
             recorder.add(picture)
             masks.append(mask)
-            report(frame + 1)
+            progress(frame + 1, options.num_frames)
+        # The video is there last: who finds it finds the truth as well.
+        _write_truth(path, options, base, stage, masks)
+    return path
+
+
+def _write_truth(
+    path: Path, options: FilmOptions, base: Rig, stage: "_Stage", masks: list[np.ndarray]
+) -> None:
     data, ends = encoded_masks(masks)
     arrays = {
         "rotations": stage.motion.rotations,
@@ -231,7 +231,6 @@ def make_film(
         "mask_bytes": data,
         "mask_ends": ends,
     }
-    save_file({k: v.contiguous() for k, v in arrays.items()}, path.with_suffix(".safetensors"))
     facts = {
         "schema": SCHEMA,
         "rig_name": base.name,
@@ -242,9 +241,12 @@ def make_film(
         "fps": options.fps,
         "options": asdict(options),
     }
-    path.with_suffix(".json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
-    aside.replace(path)
-    return path
+    write_atomically(
+        {
+            path.with_suffix(".safetensors"): save({k: v.contiguous() for k, v in arrays.items()}),
+            path.with_suffix(".json"): json.dumps(facts, indent=1).encode(),
+        }
+    )
 
 
 def natural_motion(rig: Rig, options: FilmOptions) -> Motion:

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from multiprocessing import get_context
@@ -15,9 +15,12 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from handavatar.capture.checks import CaptureError
+from handavatar.errors import SEEDS, raise_if_refused, require_ranges
 from handavatar.hand.rigs import load_rig
-from handavatar.jobs.files import write_atomically
+from handavatar.jobs.files import refuse_file_in_use, write_atomically
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.signals import is_stopping, unbroken
 from handavatar.synthetic.crops import MadeCrops, make_crops
 from handavatar.tracker.measures import TrackerFigures, measure_tracker
 from handavatar.tracker.model import (
@@ -47,8 +50,6 @@ _JUDGED_FROM = 1_000_000
 """Seeds from here on are never taught with."""
 _IN_USE = TrackerOptions(turn=0.2, any_turn=0.0, sides=(1.3, 1.6), shift=0.05, mirrored=0.0)
 """How hands lie in crops that are cut about where they were seen before."""
-Report = Callable[[str, int, int, float], None]
-"""Told what is being done, how much of it, of how much, and the loss."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,19 @@ class TrackerTrainOptions:
     """learning rate at its highest"""
     resume: bool = False
     """go on where a training of this file ended, or was ended"""
+    overwrite: bool = False
+    """replace a file at OUT, and what a training of it has left"""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            count=(1, 10**8),
+            steps=(1, 10**8),
+            seed=SEEDS,
+            processes=(0, 1024),
+            rate=(1e-12, 1),
+        )
 
 
 @dataclass(frozen=True)
@@ -86,27 +100,37 @@ class TrackerEvaluateOptions:
     count: int = 2000
     """made pictures that none was taught with"""
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, count=(1, 10**7))
 
-def train_made_tracker(
-    options: TrackerTrainOptions, report: Report | None = None
-) -> TrainedTracker:
+
+def train_made_tracker(options: TrackerTrainOptions, progress: Progress = SILENT) -> TrainedTracker:
     """Makes what pictures are missing, teaches a network, writes it.
 
+    Args:
+        options: how it is taught.
+        progress: told how far it is.
+
     Raises:
+        Interrupted: the command was told to stop; ``resume`` goes on with the state that it left.
         CaptureError: nothing to go on with, or a damaged file.
+        FolderInUse: there is a file at ``out`` already.
         NotFinite: the loss, a weight or the optimiser's state is no longer finite; it names what,
             in which step, and how to go on.
         TrackerError: the file to start from is no tracker, or one of other points.
     """
-    tell = report or (lambda doing, done, total, loss: None)
     state_file = options.out.with_suffix(".state")
+    for path in (options.out, state_file):
+        refuse_file_in_use(path, options.overwrite or options.resume)
     if options.resume and not state_file.is_file():
         raise CaptureError(
-            f"{state_file}: there is nothing to go on with", "train without --resume"
+            f"{state_file}: there is nothing to go on with", "train without `resume=True`"
         )
     rig = load_rig(RIG)
     points = TrackedPoints.of(rig, NUM_SKIN_POINTS)
-    files = make_pictures(options, lambda done, total: tell("pictures", done, total, 0.0))
+    stages = progress.stages({"pictures": 0.02 * options.count, "training": 1.0 * options.steps})
+    files = make_pictures(options, stages["pictures"])
     torch.manual_seed(options.seed)
     network = HandNetwork(len(points))
     if options.start is not None:
@@ -122,21 +146,26 @@ def train_made_tracker(
             require_finite(state, "state")
             training.restore(state)
         except (OSError, SafetensorError, KeyError, RuntimeError, NotFinite) as error:
+            raise_if_refused(error)
             raise CaptureError(
-                f"{state_file} cannot be gone on with ({error})", "train without --resume"
+                f"{state_file} cannot be gone on with ({error})", "train without `resume=True`"
             ) from error
     lessons = draw_lessons(read_pictures(files), training)
     saved, written = time.monotonic(), training.step
+    stages["training"].skip(training.step, options.steps)
     for batch in lessons:
-        loss = training.teach(batch)
+        with unbroken():
+            loss = training.teach(batch)
         is_saved = time.monotonic() - saved > _SAVED_EVERY or training.step == options.steps
+        is_saved = is_saved or is_stopping()
         state = training.state() if is_saved else {}
         if found := find_not_finite({"loss": loss, **state}):
             raise NotFinite(f"step {training.step}: {found}", _way_from(options, written))
-        tell("training", training.step, options.steps, loss)
         if is_saved:
-            write_atomically({state_file: save(state)})
+            with unbroken():
+                write_atomically({state_file: save(state)})
             saved, written = time.monotonic(), training.step
+        stages["training"](training.step, options.steps, loss=loss)
     tracker = TrainedTracker(training.taught().cpu(), points)
     record = {
         "pictures": IN_A_FILE * len(files),
@@ -151,11 +180,11 @@ def train_made_tracker(
 def _way_from(options: TrackerTrainOptions, written: int) -> str:
     """What to do after a step that was not finite; the step of the state that was written."""
     again = "give the same command again with"
-    rate = f"--rate {options.rate / 2:g}"
+    rate = f"`rate={options.rate / 2:g}`"
     if not written:
         return f"{again} {rate}"
     state_file = options.out.with_suffix(".state")
-    return f"{state_file} holds step {written}, which is good\n{again} --resume {rate}"
+    return f"{state_file} holds step {written}, which is good\n{again} `resume=True` {rate}"
 
 
 def evaluate_made_tracker(options: TrackerEvaluateOptions) -> TrackerFigures:
@@ -188,19 +217,19 @@ def draw_lessons(pictures: CropBatch, training: TrackerTraining) -> Iterator[Cro
         yield pictures.chosen(chosen)
 
 
-def make_pictures(options: TrackerTrainOptions, report: Callable[[int, int], None]) -> list[Path]:
+def make_pictures(options: TrackerTrainOptions, progress: Progress = SILENT) -> list[Path]:
     """Files of made pictures, of which those that are missing are made."""
     options.pictures.mkdir(parents=True, exist_ok=True)
     seeds = range(options.seed, options.seed + -(-options.count // IN_A_FILE))
     files = [options.pictures / f"made-{seed:06d}.safetensors" for seed in seeds]
     missing = [(file, seed) for file, seed in zip(files, seeds, strict=True) if not file.is_file()]
-    report(len(files) - len(missing), len(files))
+    progress.skip(len(files) - len(missing), len(files))
     if not missing:
         return files
     processes = options.processes or os.cpu_count() or 1
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
         for done, _ in enumerate(pool.map(_make_file, *zip(*missing, strict=True)), start=1):
-            report(len(files) - len(missing) + done, len(files))
+            progress(len(files) - len(missing) + done, len(files))
     return files
 
 
@@ -231,5 +260,6 @@ def read_pictures(files: list[Path]) -> CropBatch:
         try:
             parts.append(load_file(file))
         except (OSError, SafetensorError) as error:
+            raise_if_refused(error)
             raise CaptureError(f"{file} cannot be read ({error})", "delete it") from error
     return CropBatch.joined(parts)

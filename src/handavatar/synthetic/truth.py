@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from handavatar.capture.checks import CaptureError, load_json, number, numbers, text_field
+from handavatar.errors import raise_if_refused
 from handavatar.geometry.cameras import Camera
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, Rig, ShapedHand
@@ -112,6 +113,7 @@ def read_film_truth(path: Path) -> FilmTruth:
         arrays = load_file(path.with_suffix(".safetensors"))
         found = {name: arrays[name] for name in _ARRAYS}
     except (OSError, SafetensorError, KeyError) as error:
+        raise_if_refused(error)
         raise CaptureError(
             f"{path}: the truth cannot be read ({error})", "make it again"
         ) from error

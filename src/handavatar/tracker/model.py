@@ -12,6 +12,7 @@ from jaxtyping import UInt8
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save
 
+from handavatar.errors import HandAvatarError, raise_if_refused
 from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import find_not_finite, require_finite
 from handavatar.jobs.threads import one_thread
@@ -22,7 +23,7 @@ SCHEMA = 1
 _ASSET = "tracker.safetensors"
 
 
-class TrackerError(ValueError):
+class TrackerError(HandAvatarError):
     """A file that is no trained tracker."""
 
 
@@ -109,6 +110,7 @@ def read_tracker(path: Path) -> TrainedTracker:
         *(OSError, SafetensorError, KeyError, ValueError, RuntimeError),
         *(TypeError, OverflowError, RecursionError),
     ) as error:
+        raise_if_refused(error)
         raise TrackerError(f"{path}: cannot be read as a tracker ({error})") from error
     return TrainedTracker(network.eval(), points)
 

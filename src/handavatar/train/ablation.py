@@ -51,6 +51,7 @@ from handavatar.field.shading import (
 from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
 from handavatar.geometry.colors import eight_bits
 from handavatar.hand.rig import ShapedHand
+from handavatar.jobs.files import write_aside
 from handavatar.jobs.finite import require_finite
 from handavatar.render.volume import composite_sparse
 from handavatar.train.appearance import (
@@ -651,9 +652,9 @@ def ablate(
                 columns[name] = _column(shading, [known[shape].views[n] for n in shown])
             finished()
     if pictures is not None:
-        pictures.parent.mkdir(parents=True, exist_ok=True)
         sheet = torch.cat(list(columns.values()), dim=1)
-        Image.fromarray(eight_bits(sheet).numpy()).save(pictures)
+        with write_aside(pictures) as aside:
+            Image.fromarray(eight_bits(sheet).numpy()).save(aside)
     return {
         "capture": folder.name,
         "steps": steps,

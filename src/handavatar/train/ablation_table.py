@@ -1,7 +1,7 @@
 """``handavatar bench --table ablation``: what each part of the shading and the shape is worth."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,9 +10,11 @@ import torch
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.frames import read_capture
+from handavatar.errors import SEEDS, ArgumentError, require_ranges
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable, step_counter
 from handavatar.jobs.files import make_folder
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.train.ablation import ROWS, ablate
 from handavatar.train.kept import (
     capture_fingerprint,
@@ -49,6 +51,10 @@ class AblationTableOptions:
     steps: int = 310
     any_commit: bool = False
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, seeds=SEEDS, steps=(1, 10**8))
+
     @property
     def names(self) -> tuple[str, ...]:
         """Of the rows.
@@ -58,7 +64,7 @@ class AblationTableOptions:
         """
         for word in self.rows:
             if not any(word in name for name in ROWS):
-                raise ValueError(f"--rows {word}: no row is called so; there are {'; '.join(ROWS)}")
+                raise ArgumentError("rows", f"no row is called {word}; there are {'; '.join(ROWS)}")
         words = self.rows or ("",)
         return tuple(name for name in ROWS if any(word in name for word in words))
 
@@ -68,14 +74,12 @@ class AblationTableOptions:
         return len(self.names) * len(self.seeds) * len(self.captures)
 
 
-def ablation_table(
-    options: AblationTableOptions, report: Callable[[int], None] | None = None
-) -> ResultTable:
+def ablation_table(options: AblationTableOptions, progress: Progress = SILENT) -> ResultTable:
     """Measures what is not kept yet, and puts all captures into one table.
 
     Args:
         options: what to compare.
-        report: told the number of rows and seeds done.
+        progress: told the number of rows and seeds done.
 
     Raises:
         CaptureError: if a capture is damaged, or what is kept is of another capture or commit.
@@ -83,7 +87,7 @@ def ablation_table(
 
     Source: paper Sec. 4.3, table of ablations; supplement, disentanglement.
     """
-    finished = step_counter(report)
+    finished = step_counter(progress, options.total_steps)
     measured = []
     for folder in options.captures:
         path = options.kept / f"{folder.name}.json"

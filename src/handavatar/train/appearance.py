@@ -5,6 +5,7 @@ anchors and what lies before them stay the same. They are found once; then a ste
 small networks and can look at pixels of all frames at once.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,6 +16,8 @@ from handavatar.avatar import HandAvatar, RenderSettings
 from handavatar.capture.frames import Frame
 from handavatar.field.anchors import Neighbours
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.stage_states import NOT_KEPT, StageState, WorkState, named_tensors
 from handavatar.render.volume import composite_sparse
 from handavatar.train.losses import color_loss
 
@@ -51,58 +54,101 @@ class SeenSamples:
     rotations: Float[Tensor, "frames bones 3"]
     clips: Int[Tensor, "frames"]
 
+    @classmethod
+    def of(cls, tensors: Mapping[str, Tensor]) -> "SeenSamples":
+        """From what :meth:`tensors` gave."""
+        own = {name: value for name, value in tensors.items() if "." not in name}
+        near = named_tensors(tensors, "neighbours.")
+        return cls(**own, neighbours=Neighbours(near["indices"], near["weights"]))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """All of it by name."""
+        own = {name: value for name, value in vars(self).items() if name != "neighbours"}
+        near = self.neighbours
+        return own | {"neighbours.indices": near.indices, "neighbours.weights": near.weights}
+
+    def moved_to(self, device: torch.device) -> "SeenSamples":
+        """The same on a device."""
+        return SeenSamples.of({name: value.to(device) for name, value in self.tensors().items()})
+
 
 @torch.no_grad()
 def find_seen_samples(
-    avatar: HandAvatar, frames: list[Frame], settings: RenderSettings, stride: int
+    avatar: HandAvatar,
+    frames: list[Frame],
+    settings: RenderSettings,
+    stride: int,
+    progress: Progress = SILENT,
+    kept: StageState = NOT_KEPT,
 ) -> SeenSamples:
     """Evaluates every ``stride``-th pixel of the hand, in both directions, of every frame.
 
     Pixels at the hand's border are left out: what they mix with the background is unknown. So are
     those of which nothing is known.
+
+    Args:
+        avatar: whose geometry.
+        frames: of training, their poses as training sees them.
+        settings: of the rays.
+        stride: pixels between two that are evaluated.
+        progress: told how many frames are done.
+        kept: where it goes on, if it was interrupted.
+
+    Raises:
+        Interrupted: if the command was told to stop.
     """
-    weights, directed, indices, shares, normals, lights = [], [], [], [], [], []
-    numbers, counts, colors, alphas, points = [], [], [], [], []
-    for number, frame in enumerate(frames):
-        state = avatar.prepare(frame.pose.to(avatar.device))
-        camera = frame.camera.to(avatar.device)
-        grid = torch.zeros_like(frame.mask)
-        grid[number % stride :: stride, (number // stride) % stride :: stride] = True
-        y, x = (frame.mask & grid).nonzero().unbind(-1)
-        rays = rays_through_pixels(camera, pixel_centers(camera)[y, x])
-        seen = avatar.visible_samples(state, rays, settings)
-        alpha = composite_sparse(
-            seen.weights, seen.rays, torch.ones_like(seen.weights)[:, None], len(x)
-        )[:, 0]
-        is_covered = alpha > 0.98
-        is_kept = is_covered[seen.rays]
-        weights.append(seen.weights[is_kept])
-        directed.append(seen.directed[is_kept])
-        indices.append(seen.neighbours.indices[is_kept])
-        shares.append(seen.neighbours.weights[is_kept])
-        normals.append(seen.neighbours.interpolated(state.anchor_normals)[is_kept])
-        lights.append(seen.neighbours.interpolated(state.light)[is_kept].half())
-        numbers.append(torch.full_like(seen.rays[is_kept], number))
-        counts.append(torch.bincount(seen.rays, minlength=len(x))[is_covered])
-        colors.append(frame.colors[y, x].to(alpha)[is_covered])
-        alphas.append(alpha[is_covered])
-        mean = composite_sparse(seen.weights, seen.rays, seen.points, len(x)) / alpha[:, None]
-        points.append(mean[is_covered])
-    starts = torch.cat(counts).cumsum(0)
-    return SeenSamples(
-        torch.cat(weights),
-        torch.cat(directed),
-        Neighbours(torch.cat(indices), torch.cat(shares)),
-        torch.cat(normals),
-        torch.cat(lights),
-        torch.cat(numbers),
-        torch.cat([torch.zeros_like(starts[:1]), starts]),
-        torch.cat(colors),
-        torch.cat(alphas),
-        torch.cat(points),
-        torch.stack([frame.pose.rotations for frame in frames]).to(avatar.device),
-        torch.tensor([frame.clip for frame in frames], device=avatar.device),
-    )
+    pieces: list[dict[str, Tensor]] = []
+    if (begun := kept.read()) is not None:
+        pieces = [named_tensors(begun.tensors, f"{n}.") for n in range(int(begun.facts["frames"]))]
+        pieces = [{k: v.to(avatar.device) for k, v in piece.items()} for piece in pieces]
+    progress.skip(len(pieces), len(frames))
+
+    def state() -> WorkState:
+        parts = {f"{n}.{k}": v for n, piece in enumerate(pieces) for k, v in piece.items()}
+        return WorkState(parts, {"frames": len(pieces)})
+
+    with kept.kept(state):
+        for number in range(len(pieces), len(frames)):
+            pieces.append(_seen_in_frame(avatar, frames[number], number, settings, stride))
+            progress(number + 1, len(frames))
+    joined = {name: torch.cat([piece[name] for piece in pieces]) for name in pieces[0]}
+    starts = joined.pop("counts").cumsum(0)
+    joined["starts"] = torch.cat([torch.zeros_like(starts[:1]), starts])
+    joined["rotations"] = torch.stack([f.pose.rotations for f in frames]).to(avatar.device)
+    joined["clips"] = torch.tensor([frame.clip for frame in frames], device=avatar.device)
+    return SeenSamples.of(joined)
+
+
+def _seen_in_frame(
+    avatar: HandAvatar, frame: Frame, number: int, settings: RenderSettings, stride: int
+) -> dict[str, Tensor]:
+    """What :class:`SeenSamples` joins, of one frame; and the number of each pixel's samples."""
+    state = avatar.prepare(frame.pose.to(avatar.device))
+    camera = frame.camera.to(avatar.device)
+    grid = torch.zeros_like(frame.mask)
+    grid[number % stride :: stride, (number // stride) % stride :: stride] = True
+    y, x = (frame.mask & grid).nonzero().unbind(-1)
+    rays = rays_through_pixels(camera, pixel_centers(camera)[y, x])
+    seen = avatar.visible_samples(state, rays, settings)
+    alpha = composite_sparse(
+        seen.weights, seen.rays, torch.ones_like(seen.weights)[:, None], len(x)
+    )[:, 0]
+    is_covered = alpha > 0.98
+    is_kept = is_covered[seen.rays]
+    mean = composite_sparse(seen.weights, seen.rays, seen.points, len(x)) / alpha[:, None]
+    return {
+        "weights": seen.weights[is_kept],
+        "directed": seen.directed[is_kept],
+        "neighbours.indices": seen.neighbours.indices[is_kept],
+        "neighbours.weights": seen.neighbours.weights[is_kept],
+        "normals": seen.neighbours.interpolated(state.anchor_normals)[is_kept],
+        "light": seen.neighbours.interpolated(state.light)[is_kept].half(),
+        "frames": torch.full_like(seen.rays[is_kept], number),
+        "counts": torch.bincount(seen.rays, minlength=len(x))[is_covered],
+        "colors": frame.colors[y, x].to(alpha)[is_covered],
+        "alpha": alpha[is_covered],
+        "points": mean[is_covered],
+    }
 
 
 def chosen_samples(

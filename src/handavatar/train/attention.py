@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from PIL import Image, ImageDraw
 from torch import Tensor
 
+from handavatar.errors import HandAvatarError
 from handavatar.field.occupancy import HandCodes
 from handavatar.field.partwise import PartwiseOccupancy
 from handavatar.field.transformer import TransformerDecoder, attention_maps
@@ -52,9 +53,9 @@ def read_attention(
     """
     decoder = field.decoder
     if not isinstance(decoder, TransformerDecoder):
-        raise ValueError(
+        raise HandAvatarError(
             f"attention: found a {type(decoder).__name__}, expected a TransformerDecoder: train a "
-            "prior with `--decoder transformer`"
+            "prior with `decoder='transformer'`"
         )
     found = field(codes, points)
     winner = found.logits.argmax(-1).where(found.whole > 0, -1)

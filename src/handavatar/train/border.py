@@ -14,6 +14,8 @@ from handavatar.avatar import HandAvatar, RenderSettings
 from handavatar.capture.frames import Frame
 from handavatar.field.occupancy import HandCodes
 from handavatar.geometry.cameras import Rays, pixel_centers, rays_through_pixels
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.stage_states import NOT_KEPT, StageState
 from handavatar.jobs.threads import mapped
 from handavatar.render.silhouette import known_distance
 from handavatar.train.losses import border_loss
@@ -38,7 +40,13 @@ class _Border:
 
 
 def fit_border(
-    avatar: HandAvatar, frames: list[Frame], steps: int, settings: RenderSettings, seed: int
+    avatar: HandAvatar,
+    frames: list[Frame],
+    steps: int,
+    settings: RenderSettings,
+    seed: int,
+    progress: Progress = SILENT,
+    kept: StageState = NOT_KEPT,
 ) -> None:
     """Trains the pair decoder until its outlines lie on the borders of the masks.
 
@@ -48,12 +56,19 @@ def fit_border(
         steps: of ``_FRAMES`` frames and ``_PIXELS`` rays of each; none if no mask has a border.
         settings: of the rays.
         seed: of frames, rays and samples.
+        progress: told how far it is.
+        kept: where it goes on, if it was interrupted.
+
+    Raises:
+        NotFinite: if a loss is NaN or infinite.
+        Interrupted: if the command was told to stop.
 
     Departs: the authors leave the outline to the colours; see
         :func:`~handavatar.train.losses.border_loss`.
     """
     generator = torch.Generator().manual_seed(seed)
-    borders = _borders(avatar, frames if steps else [])
+    parts = progress.stages({"borders": 0.11 * len(frames), "border": 0.55 * steps})
+    borders = _borders(avatar, frames if steps else [], parts["borders"])
 
     def loss_of_step() -> Float[Tensor, ""]:
         losses = []
@@ -67,10 +82,11 @@ def fit_border(
         return torch.stack(losses).mean()
 
     decoder, steps = avatar.occupancy.decoder, steps if borders else 0
-    descend("border", decoder, steps, (_RATE, _LAST_RATE), loss_of_step)
+    rates = (_RATE, _LAST_RATE)
+    descend("border", decoder, steps, rates, loss_of_step, generator, parts["border"], kept)
 
 
-def _borders(avatar: HandAvatar, frames: list[Frame]) -> list[_Border]:
+def _borders(avatar: HandAvatar, frames: list[Frame], progress: Progress) -> list[_Border]:
     def border(frame: Frame) -> _Border:
         pose, camera = frame.pose.to(avatar.device), frame.camera.to(avatar.device)
         codes = avatar.occupancy.encode(avatar.parts, avatar.personal(pose).posed(pose))
@@ -78,7 +94,8 @@ def _borders(avatar: HandAvatar, frames: list[Frame]) -> list[_Border]:
         rays = rays_through_pixels(camera, pixel_centers(camera)[y, x])
         return _Border(codes, rays, frame.alpha[y, x].to(avatar.device))
 
-    return [border for border in mapped(border, frames) if len(border.coverage)]
+    found = mapped(border, frames, progress=progress)
+    return [border for border in found if len(border.coverage)]
 
 
 def _beside(

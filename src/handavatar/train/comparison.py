@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from handavatar.errors import SEEDS, ArgumentError, require_ranges
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
@@ -29,7 +30,8 @@ from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
-from handavatar.jobs.files import make_folder
+from handavatar.jobs.files import make_folder, write_aside
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.train.attention import attention_figures, attention_picture, read_attention
 from handavatar.train.kept import commit_notes, present_commit
 from handavatar.train.labelled_poses import LabelledPose
@@ -87,6 +89,20 @@ class ComparisonOptions:
     rounds: int = POINT_ROUNDS
     device: str = "cpu"
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            guides=(0, 4),
+            seeds=SEEDS,
+            steps=(1, 10**8),
+            points=(1, 10**6),
+            poses=(2, 10**5),
+            judged_points=(2, 10**6),
+            measured_poses=(2, 10**5),
+            rounds=(0, 4),
+        )
+
 
 GUIDED: Decoder = "coap"
 """The decoder that tells guides apart, as in the paper."""
@@ -135,14 +151,14 @@ class DecoderScores:
 def compare_decoders(
     options: ComparisonOptions,
     measures: Sequence[Measure] = (),
-    report: Callable[[str, int, dict[str, float]], None] | None = None,
+    progress: Progress = SILENT,
 ) -> dict[str, Any]:
     """Trains every decoder with every seed and judges all on the same poses.
 
     Args:
         options: see :class:`ComparisonOptions`.
         measures: further columns, such as Laplacian, Chamfer and seam of extracted meshes.
-        report: called now and then with what is being trained, the step and current figures.
+        progress: told what is being trained, and how far it is.
 
     Returns:
         A value for JSON: ``options``, ``commits`` (of each training), ``note``, ``decoders`` (by
@@ -175,9 +191,18 @@ def compare_decoders(
         )
         return evaluation_poses(options_of, untrained_field("pair").margin)
 
+    names = [f"{one.name}-{seed}" for one in contenders(options) for seed in options.seeds]
+    parts = progress.stages(dict.fromkeys(names, 1.0))
     for contender in contenders(options):
         trainings = [
-            _training(options, contender, seed, judged_by, measures, report)
+            _training(
+                options,
+                contender,
+                seed,
+                judged_by,
+                measures,
+                parts[f"{contender.name}-{seed}"],
+            )
             for seed in options.seeds
         ]
         for seed, training in zip(options.seeds, trainings, strict=True):
@@ -268,23 +293,24 @@ def _interval(interval: Mapping[str, float], scale: float = 1.0) -> str:
 
 def _check(options: ComparisonOptions) -> None:
     if "pair" not in options.decoders or len(set(options.decoders)) < 2:
-        raise ValueError(
-            f"comparison: found the decoders {options.decoders}, expected 'pair' and at least one "
-            f"other of {get_args(Decoder)}"
+        raise ArgumentError(
+            "decoders",
+            str(options.decoders),
+            f"'pair' and at least one other of {get_args(Decoder)}",
         )
     if any(rounds < 0 for rounds in options.guides) or len(set(options.guides)) < len(
         options.guides
     ):
-        raise ValueError(
-            f"comparison: found the guides {options.guides}, expected different numbers of "
-            "subdivisions, 0 or more"
+        raise ArgumentError(
+            "guides", str(options.guides), "different numbers of subdivisions, 0 or more"
         )
     if not options.seeds or len(set(options.seeds)) < len(options.seeds):
-        raise ValueError(f"comparison: found the seeds {options.seeds}, expected different ones")
+        raise ArgumentError("seeds", str(options.seeds), "different ones")
     if options.poses < 2 or not 2 <= options.measured_poses <= options.poses:
-        raise ValueError(
-            f"comparison: found {options.poses} poses of which {options.measured_poses} are "
-            "measured, expected two or more of both and no more measured than judged"
+        raise ArgumentError(
+            "measured_poses",
+            f"{options.measured_poses} of {options.poses} poses",
+            "two or more of both and no more measured than judged",
         )
 
 
@@ -294,7 +320,7 @@ def _training(
     seed: int,
     judged_by: Callable[[int], Judges],
     measures: Sequence[Measure],
-    report: Callable[[str, int, dict[str, float]], None] | None,
+    progress: Progress,
 ) -> dict[str, Any]:
     """What one training reached: read where it is kept, else trained, judged and kept.
 
@@ -324,7 +350,7 @@ def _training(
             folder=options.priors / name,
             device=options.device,
         ),
-        None if report is None else lambda step, figures: report(name, step, figures),
+        progress,
     ).to("cpu")
     seconds = time.perf_counter() - start
     columns = _columns(field, *judged_by(contender.rounds), options, measures)
@@ -411,7 +437,8 @@ def _attention(field: PartwiseOccupancy, options: ComparisonOptions) -> dict[str
             "preference_untrained": _mean_preference(attention_figures(control)),
             "parts": by_part,
         }
-    attention_picture(readings).save(options.priors / "attention.png")
+    with write_aside(options.priors / "attention.png") as aside:
+        attention_picture(readings).save(aside)
     return {"picture": "attention.png", **figures}
 
 

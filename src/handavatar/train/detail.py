@@ -6,7 +6,6 @@ hundreds of them fit into a minute.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -24,12 +23,19 @@ from handavatar.geometry.cameras import project
 from handavatar.geometry.meshes import face_cross_products
 from handavatar.geometry.rotations import invert_rigid
 from handavatar.jobs.finite import require_finite
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.signals import unbroken
+from handavatar.jobs.stage_states import NOT_KEPT, StageState, WorkState, named_tensors
 from handavatar.jobs.threads import mapped
 from handavatar.render.chart import texels_of
 from handavatar.render.rasterize import Fragments, covered_pixels, interpolate, rasterize
 from handavatar.train.appearance import SeenSamples
 from handavatar.train.losses import color_loss
-from handavatar.train.progress import Progress
+from handavatar.train.optimizer_state import (
+    optimizer_options,
+    optimizer_tensors,
+    restore_optimizer,
+)
 from handavatar.train.unwrap import UnwrapView, unwrap_pictures
 
 PATCH = 64
@@ -103,7 +109,7 @@ class LearnedDetail:
 
 @torch.no_grad()
 def find_detail_views(
-    avatar: HandAvatar, frames: list[Frame], seen: SeenSamples
+    avatar: HandAvatar, frames: list[Frame], seen: SeenSamples, progress: Progress = SILENT
 ) -> list[DetailView]:
     """Every pixel that the hand covers, in every frame, without a march along its ray.
 
@@ -115,6 +121,7 @@ def find_detail_views(
         avatar: with a texture, which plays no part.
         frames: of training, their poses as training sees them.
         seen: pixels of the same frames, of pictures of any size.
+        progress: told how many frames are done.
     """
     vertices = avatar.rig.template_vertices
     near = nearest_anchors(avatar.anchors.positions(vertices), vertices)
@@ -127,7 +134,7 @@ def find_detail_views(
         mine = owners == number
         return _view_of(avatar, frames[number], albedo, seen.points[mine], light[mine])
 
-    return mapped(view_of, range(len(frames)))
+    return mapped(view_of, range(len(frames)), progress=progress)
 
 
 @torch.no_grad()
@@ -212,7 +219,8 @@ def learn_detail(
     perceptual: PerceptualLoss,
     perceptual_weight: float,
     seed: int,
-    tell: Callable[[], None] = lambda: None,
+    progress: Progress = SILENT,
+    kept: StageState = NOT_KEPT,
 ) -> LearnedDetail:
     """Gives the avatar a texture: unwrapped from the frames, then learned on patches.
 
@@ -227,30 +235,31 @@ def learn_detail(
         perceptual: beside the colour loss and SSIM.
         perceptual_weight: of it.
         seed: of the patches.
-        tell: called now and then; may raise to end the work.
+        progress: told how far it is.
+        kept: where it goes on, if it was interrupted.
+
+    Raises:
+        NotFinite: if a loss is NaN or infinite.
+        Interrupted: if the command was told to stop.
 
     Departs: the paper has no texture.
     """
+    count = len(frames)
+    seconds = {"views": 0.2 * count, "unwrapping": 0.3 * count, "detail": 0.06 * steps}
+    parts = progress.stages(seconds)
     texture = avatar.give_texture(size)
-    views = find_detail_views(avatar, frames, seen)
-    tell()
-    unwrapped = unwrap_frames(avatar, frames, views)
-    tell()
-    with Progress("detail", steps) as progress:
-
-        def told(step: int, figures: dict[str, float]) -> None:
-            progress.update(step, **figures)
-            tell()
-
-        learned = learn_texels(
-            unwrapped.residual,
-            views,
-            steps,
-            perceptual,
-            perceptual_weight,
-            seed,
-            told,
-        )
+    views = find_detail_views(avatar, frames, seen, parts["views"])
+    unwrapped = unwrap_frames(avatar, frames, views, parts["unwrapping"])
+    learned = learn_texels(
+        unwrapped.residual,
+        views,
+        steps,
+        perceptual,
+        perceptual_weight,
+        seed,
+        parts["detail"],
+        kept,
+    )
     with torch.no_grad():
         texture.texels.copy_(faded(learned, unwrapped.seen))
     return LearnedDetail(unwrapped.seen, unwrapped.seen_share)
@@ -273,7 +282,10 @@ class UnwrappedTexture:
 
 @torch.no_grad()
 def unwrap_frames(
-    avatar: HandAvatar, frames: list[Frame], views: list[DetailView]
+    avatar: HandAvatar,
+    frames: list[Frame],
+    views: list[DetailView],
+    progress: Progress = SILENT,
 ) -> UnwrappedTexture:
     """Unwraps the frames onto the chart of the avatar's texture.
 
@@ -281,7 +293,9 @@ def unwrap_frames(
         avatar: with a texture.
         frames: of training.
         views: of the same frames.
+        progress: told how far it is.
     """
+    parts = progress.stages({"unwrapping": 1.0, "medians": 1.0})
     texture = _texture_of(avatar)
     rig, size = avatar.rig.to("cpu"), texture.size
     corners = texture.corners.cpu()
@@ -295,9 +309,11 @@ def unwrap_frames(
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     uv_areas = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]).abs() / 2
     pictures = mapped(
-        lambda pair: _unwrap_view(avatar, *pair), list(zip(frames, views, strict=True))
+        lambda pair: _unwrap_view(avatar, *pair),
+        list(zip(frames, views, strict=True)),
+        progress=parts["unwrapping"],
     )
-    found = unwrap_pictures(pictures, rig.faces, texels, corners)
+    found = unwrap_pictures(pictures, rig.faces, texels, corners, parts["medians"])
     residual = texels.filled(found.residual * (found.seen / (found.seen + _SEEN))[:, None])
     residual = residual * believed_share(residual, pictures)
     seen = torch.zeros(size, size)
@@ -417,7 +433,8 @@ def learn_texels(
     perceptual: PerceptualLoss,
     perceptual_weight: float,
     seed: int,
-    tell: Callable[[int, dict[str, float]], object] = lambda step, figures: None,
+    progress: Progress = SILENT,
+    kept: StageState = NOT_KEPT,
 ) -> Float[Tensor, "size size 3"]:
     """Texels that make patches look like the photographs.
 
@@ -428,10 +445,12 @@ def learn_texels(
         perceptual: beside the colour loss and SSIM.
         perceptual_weight: of it.
         seed: of the patches.
-        tell: hears the number of each step that is done, and its figures.
+        progress: told the steps done.
+        kept: where it goes on, if it was interrupted.
 
     Raises:
         NotFinite: if a loss is NaN or infinite.
+        Interrupted: if the command was told to stop.
     """
     views = [view for view in views if bool(view.is_known.any())]
     if not views or steps == 0:
@@ -444,27 +463,71 @@ def learn_texels(
     for level in levels:
         level.requires_grad_(True)
     optimizer = torch.optim.Adam(levels, lr=_RATE, betas=(0.9, 0.99))
-    for step in range(1, steps + 1):
-        generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
-        for group in optimizer.param_groups:
-            group["lr"] = _RATE * _DECAY ** ((step - 1) / steps)
-        optimizer.zero_grad(set_to_none=True)
-        loss = start.new_zeros(())
-        squared = 0.0
-        for _ in range(_PATCHES):
-            view = views[int(torch.randint(len(views), (), generator=generator))]
-            window = _window(view, generator)
-            found, truth = _patch(view, window, start, levels)
-            loss = loss + _patch_loss(found, truth, perceptual, perceptual_weight) / _PATCHES
-            squared += float((found.detach() - truth).square().mean()) / _PATCHES
-        loss = loss + _ROUGHNESS_WEIGHT * levels[0].square().mean()
-        loss.backward()
-        optimizer.step()
-        figures = {"loss": float(loss.detach()), "psnr": -10 * math.log10(max(squared, 1e-10))}
-        require_finite(figures, f"detail, step {step}")
-        tell(step, figures)
+    done = 0
+    if (begun := kept.read()) is not None:
+        with torch.no_grad():
+            for number, level in enumerate(levels):
+                level.copy_(begun.tensors[f"level.{number}"])
+        restore_optimizer(optimizer, named_tensors(begun.tensors, "adam."), begun.facts["adam"])
+        done = int(begun.facts["step"])
+
+    def state() -> WorkState:
+        tensors = {f"level.{number}": level for number, level in enumerate(levels)}
+        tensors |= {f"adam.{name}": v for name, v in optimizer_tensors(optimizer).items()}
+        return WorkState(tensors, {"step": done, "adam": optimizer_options(optimizer)})
+
+    progress.skip(done, steps)
+    with kept.kept(state) as now_and_then:
+        for step in range(done + 1, steps + 1):
+            with unbroken():
+                figures = _texel_step(
+                    start,
+                    views,
+                    levels,
+                    optimizer,
+                    perceptual,
+                    perceptual_weight,
+                    seed,
+                    step,
+                    steps,
+                )
+                done = step
+            now_and_then()
+            progress(step, steps, **figures)
     with torch.no_grad():
         return start + sum((_enlarged(level, size) for level in levels), torch.zeros_like(start))
+
+
+def _texel_step(
+    start: Float[Tensor, "size size 3"],
+    views: list[DetailView],
+    levels: list[Tensor],
+    optimizer: torch.optim.Optimizer,
+    perceptual: PerceptualLoss,
+    perceptual_weight: float,
+    seed: int,
+    step: int,
+    steps: int,
+) -> dict[str, float]:
+    """One optimiser step on a few patches; returns its figures."""
+    generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
+    for group in optimizer.param_groups:
+        group["lr"] = _RATE * _DECAY ** ((step - 1) / steps)
+    optimizer.zero_grad(set_to_none=True)
+    loss = start.new_zeros(())
+    squared = 0.0
+    for _ in range(_PATCHES):
+        view = views[int(torch.randint(len(views), (), generator=generator))]
+        window = _window(view, generator)
+        found, truth = _patch(view, window, start, levels)
+        loss = loss + _patch_loss(found, truth, perceptual, perceptual_weight) / _PATCHES
+        squared += float((found.detach() - truth).square().mean()) / _PATCHES
+    loss = loss + _ROUGHNESS_WEIGHT * levels[0].square().mean()
+    loss.backward()
+    optimizer.step()
+    figures = {"loss": float(loss.detach()), "psnr": -10 * math.log10(max(squared, 1e-10))}
+    require_finite(figures, f"detail, step {step}")
+    return figures
 
 
 def _window(view: DetailView, generator: torch.Generator) -> tuple[slice, slice]:

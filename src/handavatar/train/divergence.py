@@ -51,8 +51,9 @@ def read_seeds(run: Run, begun: int) -> list[SeedUse]:
         ]
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
-            f"{path}: says of a seed too little, or something else ({error!r})\n"
-            "delete it: the run then goes on with the seed it was begun with"
+            f"{path}: says of a seed too little, or something else ({error!r})",
+            "",
+            "delete it: the run then goes on with the seed it was begun with",
         ) from error
     return uses or [SeedUse(begun)]
 
@@ -103,7 +104,7 @@ def divergence_noted(run: Run, begun: int, seed: int, words: str) -> Iterator[No
         raise NotFinite(
             error.found,
             f"{state} with another seed\ngive the same command again with {words} "
-            f"--seed {_unused_seed([*earlier, last], seed)}",
+            f"`seed={_unused_seed([*earlier, last], seed)}`",
         ) from error
 
 

@@ -1,17 +1,19 @@
 """``handavatar bench --table geometry``: every decoder, by IoU and by its extracted meshes."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
 
+from handavatar.errors import require_ranges
 from handavatar.evaluate.geometry import Skin, Truth
 from handavatar.evaluate.tables import ResultTable
 from handavatar.field.decoders import OccupancyField
 from handavatar.field.occupancy import HandCodes
 from handavatar.hand.parts import Parts, divide_into_parts
 from handavatar.hand.rig import PosedHand
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.train.comparison import (
     ComparisonOptions,
     compare_decoders,
@@ -34,6 +36,11 @@ class GeometryTableOptions(ComparisonOptions):
     """
 
     resolution: int = 128
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        super().__post_init__()
+        require_ranges(self, resolution=(2, 1024))
 
     @property
     def total_steps(self) -> int:
@@ -76,24 +83,15 @@ class MeshMeasure:
         return {name: float(getattr(row, name)) for name in _MESH_COLUMNS}
 
 
-def geometry_table(
-    options: GeometryTableOptions, report: Callable[[int], None] | None = None
-) -> ResultTable:
+def geometry_table(options: GeometryTableOptions, progress: Progress = SILENT) -> ResultTable:
     """Trains and judges; see :func:`handavatar.train.comparison.compare_decoders`.
 
     Args:
         options: what to compare.
-        report: told the number of training steps done.
+        progress: told how far it is.
 
     Source: paper Sec. 4.2, table of geometry.
     """
-    done: dict[str, int] = {}
-
-    def progress(name: str, step: int, _: dict[str, float]) -> None:
-        done[name] = step
-        if report is not None:
-            report(sum(done.values()))
-
     measure = MeshMeasure(options.resolution)
     table = comparison_table(compare_decoders(options, (measure,), progress))
     what = (

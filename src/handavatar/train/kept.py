@@ -74,7 +74,7 @@ def read_kept(path: Path, sha256: str, any_commit: bool) -> dict[str, Any]:
         raise CaptureError(
             f"{path}: its figures were measured by commit {', '.join(others)[:200]}, this is "
             f"{present_commit()}",
-            f"give --any-commit to see them as they are, or {_ANEW}",
+            f"give `any_commit=True` to see them as they are, or {_ANEW}",
         )
     return kept
 

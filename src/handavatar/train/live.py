@@ -26,9 +26,10 @@ from safetensors import SafetensorError
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
+from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import NotFinite
+from handavatar.jobs.progress import Progress
 from handavatar.train.corrections import PoseCorrections
-from handavatar.train.progress import told_to
 from handavatar.train.runs import Run
 
 Phase = Literal["training", "finished", "stopped"]
@@ -49,11 +50,12 @@ class LiveState:
 
     Attributes:
         phase: ``training`` says what the trainer last said; it may have been killed since.
-        job: such as ``outlines`` or ``train``; empty before the first.
-        step: of the job, done.
-        total: steps of the job.
+        job: the stage, such as ``outlines`` or ``train``; empty before the first.
+        step: of the stage, done.
+        total: steps of the stage.
         steps_per_second: at present.
-        seconds_left: of the job; None if it is not known.
+        share: of the whole training that is done, in [0, 1].
+        seconds_left: of the whole training; None if it is not known.
         figures: latest values, such as ``loss``.
         process: number of the trainer's process.
         host: name of its machine.
@@ -65,6 +67,7 @@ class LiveState:
     step: int = 0
     total: int = 0
     steps_per_second: float = 0.0
+    share: float = 0.0
     seconds_left: float | None = None
     figures: dict[str, float] = field(default_factory=dict)
     process: int = 0
@@ -100,7 +103,7 @@ def read_live(run: Run) -> LiveState | None:
     try:
         content = json.loads((live_folder(run) / "progress.json").read_bytes())
         # A whole number may stand for any.
-        for name in ("steps_per_second", "seconds_left", "time"):
+        for name in ("steps_per_second", "share", "seconds_left", "time"):
             if content.get(name) is not None:
                 content[name] = float(content[name])
         figures = {name: float(value) for name, value in content["figures"].items()}
@@ -131,8 +134,12 @@ def live_poses(avatar: HandAvatar) -> tuple[torch.Tensor, torch.Tensor] | None:
 
 @contextmanager
 def shown_live(
-    run: Run, avatar: HandAvatar, corrections: PoseCorrections | None, frames: list[Frame]
-) -> Iterator[None]:
+    run: Run,
+    avatar: HandAvatar,
+    corrections: PoseCorrections | None,
+    frames: list[Frame],
+    progress: Progress,
+) -> Iterator[Progress]:
     """While it lasts, others can see how far the training is.
 
     Args:
@@ -140,13 +147,17 @@ def shown_live(
         avatar: that is trained; read only.
         corrections: of the frames' poses; read only.
         frames: of training.
+        progress: of the training.
+
+    Yields:
+        The same progress, which others see, too.
     """
     live = _Live(run, avatar, corrections, frames)
     live.begin()
     phase: Phase = "stopped"
     try:
-        with told_to(live.hear):
-            yield
+        with progress.heard_by(live.hear) as heard:
+            yield heard
         phase = "finished"
     finally:
         live.end(phase)
@@ -227,16 +238,16 @@ class _Live:
 
     def _tell(self, phase: Phase) -> None:
         last = dict(self._last)
-        known = ("job", "step", "total", "steps_per_second", "seconds_left")
+        known = ("job", "step", "total", "steps_per_second", "share", "seconds_left")
         state = {name: last.pop(name) for name in known if name in last}
-        last.pop("note", None)
+        for name in ("command", "note"):
+            last.pop(name, None)
         figures = {name: value for name, value in last.items() if value is not None}
         state |= {"phase": phase, "figures": figures}
         state |= {"process": os.getpid(), "host": socket.gethostname(), "time": time.time()}
         path = live_folder(self._run) / "progress.json"
-        aside = path.with_name(f".tmp-{os.getpid()}-progress.json")
-        aside.write_text(json.dumps(state, allow_nan=False), encoding="utf-8")
-        aside.replace(path)
+        # Written anew all the time: after a crash of the machine nobody misses it.
+        write_atomically({path: json.dumps(state, allow_nan=False).encode()}, is_durable=False)
 
     def _show(self) -> None:
         live: dict[str, Any] = {"job": self._last["job"], "step": self._last["step"]}

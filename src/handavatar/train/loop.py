@@ -1,9 +1,11 @@
 """The training loop: capture in, avatar out. There is only this one."""
 
+import json
 import math
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,11 +13,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from handavatar import __version__
 from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar, RenderSettings, chosen_device
 from handavatar.capture.frames import FITTED_SIDE, Capture, CaptureError, Frame, read_capture
 from handavatar.capture.soundness import require_sound
 from handavatar.capture.view import view_of
 from handavatar.edit import Edit
+from handavatar.errors import SEEDS, argument, require_ranges
 from handavatar.evaluate.metrics import mean_color
 from handavatar.evaluate.perceptual import PerceptualChoice, PerceptualLoss, perceptual_loss
 from handavatar.field.shading import CueSet, OrientedCues, PaperCues, TracedCues
@@ -25,6 +29,16 @@ from handavatar.geometry.meshes import SurfacePoints, is_inside
 from handavatar.geometry.rotations import mean_rotation
 from handavatar.hand.rigs import find_rig
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.signals import Interrupted, heard_signals, stop_point, unbroken
+from handavatar.jobs.stage_states import (
+    NOT_KEPT,
+    StageState,
+    StageStates,
+    WorkState,
+    named_tensors,
+    state_files,
+)
 from handavatar.train.appearance import (
     SeenSamples,
     appearance_loss,
@@ -60,9 +74,9 @@ from handavatar.train.outlines import (
 from handavatar.train.personal_occupancy import fit_occupancy
 from handavatar.train.pretraining import wide_and_narrow
 from handavatar.train.prior import SHIPPED_PRIOR, load_prior
-from handavatar.train.progress import Progress
 from handavatar.train.registration import register_training
 from handavatar.train.runs import (
+    UNFINISHED_STAGES,
     Checkpoint,
     Run,
     append_log,
@@ -78,7 +92,6 @@ from handavatar.train.runs import (
 )
 from handavatar.train.seen_anchors import count_seen_anchors
 from handavatar.train.sky import place_directions, relit
-from handavatar.train.stopping import Interrupted, stop_signals
 
 
 @dataclass(frozen=True)
@@ -255,6 +268,10 @@ class TrainOptions:
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, steps=(1, 10**8), checkpoint_every=(1, 10**8), seed=SEEDS)
+
 
 @dataclass(frozen=True, eq=False)
 class Training:
@@ -271,8 +288,12 @@ class Training:
     optimizers: dict[str, torch.optim.Optimizer]
 
 
-def train(options: TrainOptions) -> Path:
+def train(options: TrainOptions, progress: Progress = SILENT) -> Path:
     """Trains an avatar and returns the run folder.
+
+    Args:
+        options: what to train and where to.
+        progress: told how far the whole training is.
 
     Raises:
         CaptureError: if the capture is damaged, has no training or test frames, or its hand,
@@ -282,18 +303,25 @@ def train(options: TrainOptions) -> Path:
         NotFinite: if a weight, an optimiser's state or a loss is no longer finite; it names what,
             and in which step. The last checkpoint stays; the run may go on from it with another
             seed.
-        Interrupted: after SIGINT or SIGTERM; a checkpoint was saved.
+        Interrupted: after SIGINT or SIGTERM; what was done is kept, and the same call goes on from
+            there.
 
     Source: paper Sec. 4.1 (end-to-end training).
     """
+    with heard_signals():
+        return _train(options, progress)
+
+
+def _train(options: TrainOptions, progress: Progress) -> Path:
     device = chosen_device(options.device)
     method = METHODS[options.method]
     steps = method.steps if options.steps is None else options.steps
-    if steps < 1:
-        raise ValueError(f"--steps {steps}: expected at least 1")
     capture = read_capture(options.capture)
-    require_sound(capture)
-    frames = training_frames(capture, method)
+    stages = progress.stages(
+        stage_seconds(method, steps, len(capture.split("train")), capture.is_tracked)
+    )
+    require_sound(capture, stages["checks"])
+    frames = training_frames(capture, method, stages["frames"])
     perceptual = perceptual_loss(options.perceptual).to(device)
     training = begin_training(capture, frames, method, options)
     views = [view_of(own) for own in frames_of_clips(capture, frames)]
@@ -301,44 +329,121 @@ def train(options: TrainOptions) -> Path:
     if len(views) > 1:
         training.avatar.info["views"] = views
     run = _open_or_create(options, capture, perceptual.name, steps)
-    live = shown_live(run, training.avatar, training.corrections, frames)
+    live = shown_live(run, training.avatar, training.corrections, frames, progress)
     begun = run.facts["seed"]
-    words = f"--out {run.folder} --resume auto"
+    words = f"{argument('out', run.folder)} `resume='auto'`"
     noted = divergence_noted(run, begun, options.seed, words)
-    with locked(run), stop_signals() as stopped, live, _repeatable(device), noted:
+    where = "before the first step"
+    with locked(run), live as progress, _repeatable(device), noted:
+        stages = progress.stages(
+            stage_seconds(method, steps, len(frames), training.corrections is not None)
+        )
         checkpoint = latest_checkpoint(run)
         take_seed(run, begun, options.seed, checkpoint.step if checkpoint else 0)
-        outlines = _fit_or_restore_outlines(run, checkpoint, training, frames, method, options)
-        # Before the checkpoint is loaded: the samples are those of the geometry as it is now.
-        seen = None
-        if method.warm_steps:
-            seen = _seen_samples(training, frames, method, checkpoint, options.seed)
-        start = _restore(run, checkpoint, training)
-        edges = EdgeSet.of(training.avatar.rig)
-        with Progress("train", steps, start) as progress:
-            for step in range(start + 1, steps + 1):
-                _set_learning_rates(training, method.decay ** ((step - 1) / steps))
-                if seen is not None and step <= method.warm_steps:
-                    figures = warm_step(training, seen, method, step, options.seed)
-                else:
-                    figures = train_step(
-                        training, frames, seen, edges, perceptual, method, step, options.seed
-                    )
-                _require_finite_step(training, figures, step)
-                append_log(run, step, figures)
-                progress.update(step, psnr=figures["psnr"], loss=figures["loss"])
-                is_last = step == steps
-                if is_last or stopped() or step % options.checkpoint_every == 0:
-                    _save(run, training, outlines, step)
-                if stopped() and not is_last:
-                    raise Interrupted(f"stopped at step {step}; continue with --resume auto")
-        with finite_stage("detail", lambda: model_tensors(training)):
-            _learn_detail(
-                training, capture, frames, seen, perceptual, method, options.seed, stopped
+        work = _fingerprint(capture, method, options)
+        done = 0
+        try:
+            outlines = _fit_or_restore_outlines(
+                run, checkpoint, training, frames, method, options, stages, work
             )
-        count_seen_anchors(training.avatar, corrected_frames(training, frames))
-        training.avatar.save(run.avatar)
+            # Before the checkpoint is loaded: the samples are those of the geometry as it is now.
+            seen = None
+            if method.warm_steps:
+                seen = _seen_samples(
+                    *(training, frames, method, checkpoint, options.seed, stages["samples"]),
+                    StageStates(run.folder / _SAMPLES_STATE, work, ("samples", "light", "done")),
+                )
+            start = done = _restore(run, checkpoint, training)
+            edges = EdgeSet.of(training.avatar.rig)
+            num_warm = min(method.warm_steps, steps)
+            warm, joint = stages["train"].split(num_warm, steps, _JOINT_STEP / _WARM_STEP)
+            warm.skip(min(start, num_warm), max(num_warm, 1))
+            if start > num_warm:
+                joint.skip(start - num_warm, steps - num_warm)
+            where = f"at step {start}"
+            try:
+                for step in range(start + 1, steps + 1):
+                    _set_learning_rates(training, method.decay ** ((step - 1) / steps))
+                    if seen is not None and step <= method.warm_steps:
+                        figures = warm_step(training, seen, method, step, options.seed)
+                        told, counted = warm, (step, num_warm)
+                    else:
+                        figures = train_step(
+                            training, frames, seen, edges, perceptual, method, step, options.seed
+                        )
+                        told, counted = joint, (step - num_warm, steps - num_warm)
+                    with unbroken():
+                        _require_finite_step(training, figures, step)
+                        append_log(run, step, figures)
+                        done, where = step, f"at step {step}"
+                        if step == steps or step % options.checkpoint_every == 0:
+                            _save(run, training, outlines, step)
+                    told(*counted, psnr=figures["psnr"], loss=figures["loss"])
+            except Interrupted:
+                with unbroken():
+                    if done > start and done % options.checkpoint_every and done < steps:
+                        _save(run, training, outlines, done)
+                raise
+            where = "while the detail is learned"
+            with finite_stage("detail", lambda: model_tensors(training)):
+                _learn_detail(
+                    *(training, capture, frames, seen, perceptual, method, options.seed),
+                    stages["detail"],
+                    StageStates(
+                        run.folder / _DETAIL_STATE, f"{work} {steps} {perceptual.name}", ("detail",)
+                    ),
+                )
+            stages["saving"](0.0)
+            count_seen_anchors(training.avatar, corrected_frames(training, frames))
+            training.avatar.save(run.avatar)
+        except KeyboardInterrupt as stop:
+            raise Interrupted(
+                f"{run.folder}: stopped {where}; the same command goes on from there"
+            ) from stop
+        for name in UNFINISHED_STAGES:
+            for path in state_files(run.folder / name):
+                path.unlink(missing_ok=True)
+        stages["saving"](1.0)
     return run.folder
+
+
+_GEOMETRY_STATE, _SAMPLES_STATE, _DETAIL_STATE = UNFINISHED_STAGES
+_WARM_STEP, _JOINT_STEP = 0.25, 2.2
+"""Usual seconds of a step of the appearance alone, and of a frame of the other steps."""
+
+
+def stage_seconds(method: Method, steps: int, count: int, is_corrected: bool) -> dict[str, float]:
+    """The stages of a training, and how long each usually takes on two cores.
+
+    Args:
+        method: of the training.
+        steps: of it.
+        count: of the training frames.
+        is_corrected: whether their poses are learned, too.
+    """
+    warm = min(method.warm_steps, steps)
+    has_light = method.warm_steps > 0 and method.cues.num_directions > 0
+    return {
+        "checks": 0.03 * count,
+        "frames": 0.02 * count + 2.0,
+        "registration": 2.0 * count if is_corrected else 0.0,
+        "outlines": 0.03 * method.outline_rounds * method.outline_visits * count,
+        "occupancy": 0.2 * count + 0.13 * method.personal_steps if method.personal_steps else 0.0,
+        "border": 0.11 * count + 0.55 * method.border_steps if method.border_steps else 0.0,
+        "samples": (4.5 if has_light else 2.0) * count if method.warm_steps else 0.0,
+        "train": _WARM_STEP * warm + _JOINT_STEP * method.frames * (steps - warm),
+        "detail": 0.5 * count + 0.06 * method.detail_steps if method.detail_size else 0.0,
+        "saving": 2.0,
+    }
+
+
+def _fingerprint(capture: Capture, method: Method, options: TrainOptions) -> str:
+    """Of all that the state of a stage before the first step depends on."""
+    budget = asdict(method) | {"cues": method.cues.name}
+    own = {"seed": options.seed, "prior": sha256(options.prior.read_bytes()).hexdigest()}
+    own |= {"capture": capture.sha256, "version": __version__, "schema": SCHEMA}
+    record = {"budget": budget} | own
+    return sha256(json.dumps(record, default=str).encode()).hexdigest()
 
 
 def _require_finite_step(training: Training, figures: dict[str, float], step: int) -> None:
@@ -348,14 +453,21 @@ def _require_finite_step(training: Training, figures: dict[str, float], step: in
         raise NotFinite(f"step {step}: {'; '.join(text for text in found if text)}")
 
 
-def training_frames(capture: Capture, method: Method) -> list[Frame]:
+def training_frames(capture: Capture, method: Method, progress: Progress = SILENT) -> list[Frame]:
     """The frames of split ``train``, as large as the method takes them.
+
+    Args:
+        capture: that holds them.
+        method: of the training.
+        progress: told how many have been read.
 
     Raises:
         CaptureError: if a frame is damaged, or a number of it is not finite.
     """
-    frames = []
-    for index in capture.split("train"):
+    frames: list[Frame] = []
+    indices = capture.split("train")
+    for index in indices:
+        progress(len(frames), len(indices))
         frame = capture.frame(index)
         frame.require_finite()
         frames.append(frame if method.picture_size is None else frame.binned(method.picture_size))
@@ -391,22 +503,21 @@ def _learn_detail(
     perceptual: PerceptualLoss,
     method: Method,
     seed: int,
-    stopped: Callable[[], bool],
+    progress: Progress,
+    states: StageStates,
 ) -> None:
-    """The texture, from the last checkpoint on: whoever is stopped here begins it anew."""
+    """The texture, from the last checkpoint on."""
     if not method.detail_size:
         return
     avatar = training.avatar
+    parts = progress.stages(
+        {"samples": 0.0 if seen is not None else 0.4 * len(frames), "detail": 1.0 * len(frames)}
+    )
     if seen is None:
         settings = RenderSettings(num_samples=method.num_samples)
         small = corrected_frames(training, frames)
-        seen = find_seen_samples(avatar, small, settings, _DETAIL_STRIDE)
+        seen = find_seen_samples(avatar, small, settings, _DETAIL_STRIDE, parts["samples"])
     corrected = corrected_frames(training, _detailed_frames(capture, frames))
-
-    def end_if_stopped() -> None:
-        if stopped():
-            raise Interrupted("stopped while the detail is learned; continue with --resume auto")
-
     learned = learn_detail(
         avatar,
         corrected,
@@ -416,7 +527,8 @@ def _learn_detail(
         perceptual,
         method.perceptual_weight,
         seed,
-        end_if_stopped,
+        parts["detail"],
+        states.begin("detail", lambda: WorkState({})),
     )
     avatar.info["detail"] = {
         "size": method.detail_size,
@@ -533,72 +645,149 @@ def _fit_or_restore_outlines(
     frames: list[Frame],
     method: Method,
     options: TrainOptions,
+    stages: dict[str, Progress],
+    fingerprint: str,
 ) -> dict[str, Tensor]:
     """Sets shape, poses and decoder as the outlines alone would have them, and returns these."""
     modules = _outline_modules(training)
+    states = StageStates(run.folder / _GEOMETRY_STATE, fingerprint, _GEOMETRY_STAGES)
     if checkpoint is None:
-        fit_geometry(training, frames, method, options.seed)
+        fit_geometry(training, frames, method, options.seed, stages, states)
         tensors = {
             f"{prefix}{name}": value.clone()
             for prefix, module in modules.items()
             for name, value in module.state_dict().items()
         }
         tensors["coefficients"] = training.avatar.coefficients.clone()
-        _save(run, training, tensors, 0)
+        with unbroken():
+            _save(run, training, tensors, 0)
+            states.remove()
         return tensors
+    states.remove()
+    for name in _GEOMETRY_STAGES:
+        stages[name].skip()
     training.avatar.occupancy.sharpness = method.sharpness
-    stored = load_checkpoint(checkpoint).tensors
+    contents = load_checkpoint(checkpoint)
+    stored = contents.tensors
+    training.avatar.info |= contents.state.get("learned", {})  # Older checkpoints have none.
     tensors = stored["outlines"]
     if "parts" in stored:  # Older checkpoints have none; they are drawn alike.
-        points = SurfacePoints(stored["parts"]["corners"], stored["parts"]["barycentric"])
-        parts = training.avatar.parts.with_points(points)
-        training.avatar.parts = parts.to(training.avatar.device)
+        _set_part_points(training, stored["parts"])
     training.avatar.coefficients.copy_(tensors["coefficients"])
     for prefix, module in modules.items():
-        module.load_state_dict(_named(tensors, prefix))
+        module.load_state_dict(named_tensors(tensors, prefix))
     return tensors
 
 
-def fit_geometry(training: Training, frames: list[Frame], method: Method, seed: int) -> None:
+def _set_part_points(training: Training, parts: Mapping[str, Tensor]) -> None:
+    points = SurfacePoints(parts["corners"], parts["barycentric"])
+    divided = training.avatar.parts.with_points(points)
+    training.avatar.parts = divided.to(training.avatar.device)
+
+
+_GEOMETRY_STAGES = ("registration", "outlines", "occupancy", "border")
+
+
+def fit_geometry(
+    training: Training,
+    frames: list[Frame],
+    method: Method,
+    seed: int,
+    stages: Mapping[str, Progress] | None = None,
+    states: StageStates | None = None,
+) -> None:
     """What comes before the first step: poses, shape and decoder, from what the frames show.
+
+    Args:
+        training: that has not begun.
+        frames: of training.
+        method: its budget.
+        seed: of all that is drawn.
+        stages: told how far its stages are.
+        states: where they go on, if they were interrupted.
 
     Raises:
         NotFinite: if one of its stages leaves NaN or infinity.
+        Interrupted: if the command was told to stop.
     """
+    avatar = training.avatar
+    if states is not None and states.whole is not None:
+        _restore_whole(training, states.whole)
 
-    def stage(name: str) -> AbstractContextManager[None]:
-        return finite_stage(name, lambda: model_tensors(training))
+    @contextmanager
+    def stage(name: str) -> Iterator[tuple[Progress, StageState]]:
+        progress = SILENT if stages is None else stages[name]
+        state = NOT_KEPT if states is None else states.begin(name, lambda: _whole(training))
+        progress(0.0)
+        with finite_stage(name, lambda: model_tensors(training)):
+            yield progress, state
 
-    if training.corrections is not None:
-        with stage("registration"), Progress("registration", 100) as progress:
+    def is_done(name: str) -> bool:
+        if states is None or not states.is_done(name):
+            return False
+        if stages is not None:
+            stages[name].skip()
+        return True
+
+    if training.corrections is not None and not is_done("registration"):
+        with stage("registration") as (progress, state):
             found = register_training(
-                training.avatar,
+                avatar,
                 training.corrections,
                 frames,
                 replace(RegisterOptions(), seed=seed),
-                lambda share: progress.update(round(100 * share)),
+                progress,
+                state,
             )
-        training.avatar.info["pose_error"] = round(found.pose_error, 3)
-    with stage("outlines"):
-        fit_outlines(
-            training.avatar,
-            None,
-            corrected_frames(training, frames),
-            method.outline_rounds,
-            method.outline_visits,
-            method.silhouette_size,
-            seed,
-        )
+        avatar.info["pose_error"] = round(found.pose_error, 3)
+    if not is_done("outlines"):
+        with stage("outlines") as (progress, state):
+            fit_outlines(
+                avatar,
+                None,
+                corrected_frames(training, frames),
+                method.outline_rounds,
+                method.outline_visits,
+                method.silhouette_size,
+                seed,
+                progress,
+                state,
+            )
     corrected = corrected_frames(training, frames)
-    if method.personal_steps:
+    if method.personal_steps and not is_done("occupancy"):
         poses = [frame.pose for frame in corrected]
-        with stage("occupancy"):
-            fit_occupancy(training.avatar, poses, method.personal_steps, seed)
-    training.avatar.occupancy.sharpness = method.sharpness
+        with stage("occupancy") as (progress, state):
+            fit_occupancy(avatar, poses, method.personal_steps, seed, progress, state)
+    avatar.occupancy.sharpness = method.sharpness
     if method.border_steps:
         settings = learned_rays(method.num_samples)
-        with stage("border"):
-            fit_border(training.avatar, corrected, method.border_steps, settings, seed)
+        with stage("border") as (progress, state):
+            fit_border(avatar, corrected, method.border_steps, settings, seed, progress, state)
+
+
+def _whole(training: Training) -> WorkState:
+    points = training.avatar.parts.points
+    tensors = model_tensors(training) | {"coefficients": training.avatar.coefficients}
+    tensors |= {"parts.corners": points.faces, "parts.barycentric": points.barycentric}
+    return WorkState(tensors, _learned_facts(training))
+
+
+def _learned_facts(training: Training) -> dict[str, Any]:
+    """What the avatar says of itself that was learned before the first step."""
+    return {name: v for name, v in training.avatar.info.items() if name == "pose_error"}
+
+
+def _restore_whole(training: Training, whole: WorkState) -> None:
+    _load_model(training, whole.tensors)
+    training.avatar.coefficients.copy_(whole.tensors["coefficients"])
+    _set_part_points(training, named_tensors(whole.tensors, "parts."))
+    training.avatar.info |= whole.facts
+
+
+def _load_model(training: Training, model: Mapping[str, Tensor]) -> None:
+    training.avatar.load_state_dict(named_tensors(model, "avatar."))
+    if training.corrections is not None:
+        training.corrections.load_state_dict(named_tensors(model, "corrections."))
 
 
 def _outline_modules(training: Training) -> dict[str, torch.nn.Module]:
@@ -617,18 +806,40 @@ def _seen_samples(
     method: Method,
     checkpoint: Checkpoint | None,
     seed: int,
+    progress: Progress,
+    states: StageStates,
 ) -> SeenSamples:
-    """Found anew; the directions of light are those of the checkpoint, if it has them already."""
+    """Found once; the directions of light are those of the checkpoint, if it has them already."""
+    has_light = method.cues.num_directions > 0
+    seconds = {"samples": 2.7 * len(frames), "light": 1.8 * len(frames) if has_light else 0.0}
+    parts = progress.stages(seconds)
     avatar, corrected = training.avatar, corrected_frames(training, frames)
     settings = RenderSettings(num_samples=method.num_samples)
-    seen = find_seen_samples(avatar, corrected, settings, method.warm_stride)
-    if method.cues.num_directions == 0:
+    directions = avatar.illumination.directions if has_light else torch.zeros(0)
+    if states.whole is not None and states.is_done("samples"):
+        tensors = dict(states.whole.tensors)
+        placed = tensors.pop("directions", directions)
+        seen = SeenSamples.of(tensors).moved_to(avatar.device)
+        parts["samples"].skip()
+    else:
+        state = states.begin("samples", lambda: WorkState({}))
+        stride = method.warm_stride
+        seen = find_seen_samples(avatar, corrected, settings, stride, parts["samples"], state)
+    if states.is_done("light"):
+        directions.copy_(placed)
+        parts["light"].skip()
         return seen
-    if checkpoint is None or checkpoint.step == 0:
-        return place_directions(avatar, corrected, seen, seed)
-    stored = load_checkpoint(checkpoint).tensors["model"]["avatar.illumination.directions"]
-    avatar.illumination.directions.copy_(stored)
-    return relit(avatar, corrected, seen)
+    found = seen
+    if has_light:
+        state = states.begin("light", lambda: WorkState(found.tensors()))
+        if checkpoint is None or checkpoint.step == 0:
+            seen = place_directions(avatar, corrected, seen, seed, parts["light"], state)
+        else:
+            stored = load_checkpoint(checkpoint).tensors["model"]
+            directions.copy_(stored["avatar.illumination.directions"])
+            seen = relit(avatar, corrected, seen, parts["light"], state)
+    states.begin("done", lambda: WorkState(seen.tensors() | {"directions": directions}))
+    return seen
 
 
 @torch.no_grad()
@@ -690,6 +901,7 @@ def train_step(
     _clear_gradients(training)
     sums: dict[str, float] = {}
     for place in range(method.frames):
+        stop_point()
         number = _frame_number(len(frames), (step - 1) * method.frames + place, seed)
         losses = frame_losses(
             training, frames[number], number, edges, perceptual, method, step, generator
@@ -893,8 +1105,9 @@ def _require_same_training(run: Run, options: TrainOptions, capture: Capture) ->
     """A run goes on with what it was begun with, or not at all."""
     if run.options.get("avatar_schema") != SCHEMA:
         raise CheckpointError(
-            f"{run.folder}: was begun by a version whose weights mean something else\n"
-            "name another folder with --out, or begin anew with --resume never"
+            f"{run.folder}: was begun by a version whose weights mean something else",
+            "",
+            "name another folder with `out`, or begin anew with `resume='never'`",
         )
     facts = run.facts
     seed = read_seeds(run, facts["seed"])[-1].seed
@@ -905,8 +1118,9 @@ def _require_same_training(run: Run, options: TrainOptions, capture: Capture) ->
     for what, old, new in zip(("capture", "seed", "method"), then, now, strict=True):
         if old != new:
             raise CheckpointError(
-                f"{run.folder}: was begun with {what} {str(old)[:12]}, now it is {str(new)[:12]}\n"
-                "name another folder with --out, or begin anew with --resume never"
+                f"{run.folder}: was begun with {what} {str(old)[:12]}, now it is {str(new)[:12]}",
+                "",
+                "name another folder with `out`, or begin anew with `resume='never'`",
             )
 
 
@@ -924,7 +1138,10 @@ def _save(run: Run, training: Training, outlines: dict[str, Tensor], step: int) 
     parts = {"corners": points.faces, "barycentric": points.barycentric}
     tensors = {"model": model_tensors(training), "outlines": outlines, "parts": parts}
     tensors |= {name: optimizer_tensors(part) for name, part in training.optimizers.items()}
-    state = {name: optimizer_options(part) for name, part in training.optimizers.items()}
+    state: dict[str, Any] = {
+        name: optimizer_options(part) for name, part in training.optimizers.items()
+    }
+    state["learned"] = _learned_facts(training)
     save_checkpoint(run, step, tensors, state)
 
 
@@ -935,14 +1152,8 @@ def _restore(run: Run, checkpoint: Checkpoint | None, training: Training) -> int
         return 0
     contents = load_checkpoint(checkpoint)
     model = contents.tensors["model"]
-    training.avatar.load_state_dict(_named(model, "avatar."))
-    if training.corrections is not None:
-        training.corrections.load_state_dict(_named(model, "corrections."))
+    _load_model(training, model)
     for name, optimizer in training.optimizers.items():
         restore_optimizer(optimizer, contents.tensors[name], contents.state[name])
     truncate_log(run, checkpoint.step)
     return checkpoint.step
-
-
-def _named(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name[len(prefix) :]: v for name, v in tensors.items() if name.startswith(prefix)}

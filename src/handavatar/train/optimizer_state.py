@@ -41,8 +41,9 @@ def restore_optimizer(
     if [group["params"] for group in current] != [list(group["params"]) for group in saved]:
         raise CheckpointError(
             f"optimiser state: saved for groups of {[len(g['params']) for g in saved]} parameters, "
-            f"this model has {[len(g['params']) for g in current]}\n"
-            "continue with the options the run was started with (options.json)"
+            f"this model has {[len(g['params']) for g in current]}",
+            "",
+            "continue with the options the run was started with (options.json)",
         )
     groups = [
         {
@@ -58,8 +59,9 @@ def restore_optimizer(
         number = int(index)
         if number >= len(parameters) or (value.ndim and value.shape != parameters[number].shape):
             raise CheckpointError(
-                f"optimiser state {key}: shape {tuple(value.shape)} fits no parameter {number}\n"
-                "continue with the options the run was started with (options.json)"
+                f"optimiser state {key}: shape {tuple(value.shape)} fits no parameter {number}",
+                "",
+                "continue with the options the run was started with (options.json)",
             )
         state.setdefault(number, {})[name] = value
     optimizer.load_state_dict({"state": state, "param_groups": groups})

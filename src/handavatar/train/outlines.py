@@ -4,6 +4,7 @@ Colours are only learned where they belong once the mesh lies on the picture. On
 whose outline is nearly that of the fine one, a frame costs a twentieth of a joint step.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -19,11 +20,18 @@ from handavatar.geometry.meshes import unique_edges
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import PosedHand, Rig
 from handavatar.jobs.finite import require_finite
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.signals import unbroken
+from handavatar.jobs.stage_states import NOT_KEPT, StageState, WorkState, named_tensors
 from handavatar.jobs.threads import mapped
 from handavatar.render.silhouette import known_at, silhouette_loss, soft_mask, soft_silhouette
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.losses import offset_loss
-from handavatar.train.progress import Progress
+from handavatar.train.optimizer_state import (
+    optimizer_options,
+    optimizer_tensors,
+    restore_optimizer,
+)
 
 # Frames per step of the shape; its learning rate falls to a tenth.
 _BATCH = 4
@@ -90,6 +98,8 @@ def fit_outlines(
     visits: int,
     size: int,
     seed: int,
+    progress: Progress = SILENT,
+    kept: StageState = NOT_KEPT,
 ) -> None:
     """Moves the avatar's shape, and the corrections, towards the masks of all frames.
 
@@ -101,9 +111,12 @@ def fit_outlines(
         visits: of every frame by the shape in one round.
         size: pixels along a side of the compared masks.
         seed: of the order of the frames.
+        progress: told how many frames were seen.
+        kept: where it goes on, if it was interrupted.
 
     Raises:
         NotFinite: if a loss is NaN or infinite.
+        Interrupted: if the command was told to stop.
 
     Departs: the authors start all losses at once.
     """
@@ -113,27 +126,64 @@ def fit_outlines(
     edges = EdgeSet.of(avatar.base_rig)
     masks = [small_mask(frame, size) for frame in frames]
     optimizer = torch.optim.Adam(avatar.shape.parameters(), lr=_RATE, betas=(0.9, 0.99))
-    passes = rounds * visits + (rounds + 1 if corrections else 0)
-    steps = rounds * visits * -(-len(frames) // _BATCH)
-    falling = torch.optim.lr_scheduler.ExponentialLR(optimizer, 0.1 ** (1 / max(steps, 1)))
-    with Progress("outlines", passes * len(frames)) as progress:
-        done = step = 0
-        for _ in range(rounds):
-            if corrections is not None:
-                done = _align(avatar, corrections, frames, progress, done)
-            for _ in range(visits):
-                order = torch.randperm(len(frames), generator=generator)
-                for chosen in order.split(_BATCH):
-                    value = _shape_step(avatar, corrections, frames, masks, edges, chosen.tolist())
-                    step += 1
-                    require_finite({"silhouette": value}, f"outlines, step {step}")
-                    optimizer.step()
-                    falling.step()
-                    done += len(chosen)
-                    progress.update(done, silhouette=value)
+    falling = 0.1 ** (1 / (rounds * visits * -(-len(frames) // _BATCH)))
+    pieces = _pieces(len(frames), rounds, visits, generator, corrections is not None)
+    total = sum(len(numbers) for _, numbers in pieces)
+    done, value = 0, math.nan
+
+    def restored() -> int:
+        state = kept.read()
+        if state is None:
+            return 0
+        avatar.shape.load_state_dict(named_tensors(state.tensors, "shape."))
         if corrections is not None:
-            _align(avatar, corrections, frames, progress, done)
+            corrections.load_state_dict(named_tensors(state.tensors, "corrections."))
+        adam = named_tensors(state.tensors, "adam.")
+        restore_optimizer(optimizer, adam, state.facts["adam"])
+        return int(state.facts["pieces"])
+
+    def state() -> WorkState:
+        tensors = {f"shape.{name}": value for name, value in avatar.shape.state_dict().items()}
+        if corrections is not None:
+            poses = corrections.state_dict()
+            tensors |= {f"corrections.{name}": value for name, value in poses.items()}
+        tensors |= {f"adam.{name}": v for name, v in optimizer_tensors(optimizer).items()}
+        return WorkState(tensors, {"pieces": done, "adam": optimizer_options(optimizer)})
+
+    done = restored()
+    seen = sum(len(numbers) for _, numbers in pieces[:done])
+    progress.skip(seen, total)
+    with kept.kept(state) as now_and_then:
+        for is_of_poses, numbers in pieces[done:]:
+            with unbroken():
+                if is_of_poses:
+                    assert corrections is not None
+                    _align(avatar, corrections, frames, numbers)
+                else:
+                    value = _shape_step(avatar, corrections, frames, masks, edges, numbers)
+                    require_finite({"silhouette": value}, f"outlines, piece {done + 1}")
+                    optimizer.step()
+                    for group in optimizer.param_groups:
+                        group["lr"] *= falling
+                done, seen = done + 1, seen + len(numbers)
+            now_and_then()
+            progress(seen, total, silhouette=value)
     optimizer.zero_grad(set_to_none=True)
+
+
+def _pieces(
+    count: int, rounds: int, visits: int, generator: torch.Generator, has_poses: bool
+) -> list[tuple[bool, list[int]]]:
+    """All that is to be done, in order: whether poses are laid or the shape is, and the frames."""
+    poses = [(True, part.tolist()) for part in torch.arange(count).split(_ALIGNED_AT_ONCE)]
+    poses = poses if has_poses else []
+    pieces = []
+    for _ in range(rounds):
+        pieces += poses
+        for _ in range(visits):
+            order = torch.randperm(count, generator=generator)
+            pieces += [(False, part.tolist()) for part in order.split(_BATCH)]
+    return pieces + poses
 
 
 def small_mask(
@@ -158,12 +208,8 @@ def corrected_pose(
 
 
 def _align(
-    avatar: HandAvatar,
-    corrections: PoseCorrections,
-    frames: list[Frame],
-    progress: Progress,
-    done: int,
-) -> int:
+    avatar: HandAvatar, corrections: PoseCorrections, frames: list[Frame], numbers: list[int]
+) -> None:
     def align(number: int) -> None:
         frame = frames[number]
         pose = frame.pose.to(avatar.device)
@@ -178,11 +224,7 @@ def _align(
         )
         corrections.set(number, pose, found)
 
-    for numbers in torch.arange(len(frames)).split(_ALIGNED_AT_ONCE):
-        mapped(align, numbers.tolist())
-        done += len(numbers)
-        progress.update(done)
-    return done
+    mapped(align, numbers)
 
 
 def _shape_step(

@@ -15,6 +15,8 @@ from handavatar.avatar import HandAvatar
 from handavatar.field.occupancy import HandCodes
 from handavatar.geometry.meshes import is_inside
 from handavatar.hand.pose import HandPose
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.stage_states import NOT_KEPT, StageState
 from handavatar.jobs.threads import mapped
 from handavatar.train.labelled_poses import training_points
 from handavatar.train.pretraining import OccupancyLoss, descend
@@ -39,7 +41,14 @@ class _KnownHand:
     is_inside: Bool[Tensor, "points"]
 
 
-def fit_occupancy(avatar: HandAvatar, poses: list[HandPose], steps: int, seed: int) -> None:
+def fit_occupancy(
+    avatar: HandAvatar,
+    poses: list[HandPose],
+    steps: int,
+    seed: int,
+    progress: Progress = SILENT,
+    kept: StageState = NOT_KEPT,
+) -> None:
     """Trains the pair decoder on the personal hand in poses like the given ones.
 
     Args:
@@ -47,6 +56,12 @@ def fit_occupancy(avatar: HandAvatar, poses: list[HandPose], steps: int, seed: i
         poses: of the training frames, as the outlines have them.
         steps: of ``_HANDS`` hands and ``_POINTS`` labelled points of each.
         seed: of poses and points.
+        progress: told how far it is.
+        kept: where it goes on, if it was interrupted.
+
+    Raises:
+        NotFinite: if a loss is NaN or infinite.
+        Interrupted: if the command was told to stop.
 
     Source: paper Sec. 3.2, L_PairOF, which the paper takes along in every step of the training.
     Departs: the authors leave the personal surface to the joint training, which in minutes sees
@@ -55,7 +70,8 @@ def fit_occupancy(avatar: HandAvatar, poses: list[HandPose], steps: int, seed: i
     loss_of = OccupancyLoss(avatar.occupancy, avatar.parts, StageTimes())
     generator = torch.Generator().manual_seed(seed)
     # Hands and labels cost as much as a step: once for all steps, one of every pose.
-    hands = _known_hands(avatar, poses if steps else [], seed)
+    parts = progress.stages({"hands": 0.2 * len(poses), "occupancy": 0.13 * steps})
+    hands = _known_hands(avatar, poses if steps else [], seed, parts["hands"])
 
     def loss_of_step() -> Float[Tensor, ""]:
         losses = []
@@ -65,10 +81,21 @@ def fit_occupancy(avatar: HandAvatar, poses: list[HandPose], steps: int, seed: i
             losses.append(loss_of.of_codes(hand.codes, hand.points[some], hand.is_inside[some]))
         return torch.stack(losses).mean()
 
-    descend("occupancy", avatar.occupancy.decoder, steps, (_RATE, _LAST_RATE), loss_of_step)
+    descend(
+        "occupancy",
+        avatar.occupancy.decoder,
+        steps,
+        (_RATE, _LAST_RATE),
+        loss_of_step,
+        generator,
+        parts["occupancy"],
+        kept,
+    )
 
 
-def _known_hands(avatar: HandAvatar, poses: list[HandPose], seed: int) -> list[_KnownHand]:
+def _known_hands(
+    avatar: HandAvatar, poses: list[HandPose], seed: int, progress: Progress
+) -> list[_KnownHand]:
     def known(number: int) -> _KnownHand:
         generator = torch.Generator().manual_seed(seed * 1_000_003 + number)
         pose = _varied(poses[number], generator)
@@ -78,7 +105,7 @@ def _known_hands(avatar: HandAvatar, poses: list[HandPose], seed: int) -> list[_
         labels = is_inside(posed.sealed_vertices, avatar.rig.sealed_faces, points)
         return _KnownHand(avatar.occupancy.encode(avatar.parts, posed), points, labels)
 
-    return mapped(known, range(len(poses)))
+    return mapped(known, range(len(poses)), progress=progress)
 
 
 def _varied(pose: HandPose, generator: torch.Generator) -> HandPose:

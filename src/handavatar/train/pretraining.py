@@ -21,6 +21,9 @@ from handavatar.hand.parts import Parts
 from handavatar.hand.rig import PosedHand
 from handavatar.jobs.files import is_empty, make_folder
 from handavatar.jobs.finite import require_finite
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.signals import unbroken
+from handavatar.jobs.stage_states import NOT_KEPT, StageState, WorkState, named_tensors
 from handavatar.train.divergence import may_take_seed
 from handavatar.train.labelled_poses import LabelledPose
 from handavatar.train.muon import Muon
@@ -29,7 +32,6 @@ from handavatar.train.optimizer_state import (
     optimizer_tensors,
     restore_optimizer,
 )
-from handavatar.train.progress import Progress
 from handavatar.train.runs import (
     RUN,
     Json,
@@ -182,34 +184,61 @@ def descend(
     steps: int,
     rates: tuple[float, float],
     loss_of_step: Callable[[], Float[Tensor, ""]],
+    generator: torch.Generator,
+    progress: Progress = SILENT,
+    kept: StageState = NOT_KEPT,
 ) -> None:
-    """Trains a decoder alone, in one go, with the prior's optimisers.
+    """Trains a decoder alone, with the prior's optimisers.
 
     Args:
-        title: of the progress.
+        title: of the stage, for errors.
         decoder: whose gradients ``loss_of_step`` gives.
         steps: how many.
         rates: highest and last learning rate; see :func:`learning_rate`.
         loss_of_step: the loss of the next step, on samples of its own.
+        generator: that draws these samples.
+        progress: told the steps done.
+        kept: where it goes on, if it was interrupted.
 
     Raises:
         NotFinite: if a loss is NaN or infinite.
+        Interrupted: if the command was told to stop.
     """
     optimizers = prior_optimizers(decoder)
-    average = math.nan
-    with Progress(title, steps) as progress:
-        for step in range(1, steps + 1):
-            set_rate(optimizers, learning_rate(step, steps, *rates))
-            for optimizer in optimizers.values():
-                optimizer.zero_grad(set_to_none=True)
-            loss = loss_of_step()
-            loss.backward()
-            for optimizer in optimizers.values():
-                optimizer.step()
-            value = float(loss.detach())
-            require_finite({"loss": value}, f"{title}, step {step}")
-            average = value if math.isnan(average) else 0.95 * average + 0.05 * value
-            progress.update(step, loss=average)
+    average, done = math.nan, 0
+
+    def state() -> WorkState:
+        tensors = {f"decoder.{name}": value for name, value in decoder.state_dict().items()}
+        for name, part in optimizers.items():
+            tensors |= {f"{name}.{key}": value for key, value in optimizer_tensors(part).items()}
+        facts: Json = {name: optimizer_options(part) for name, part in optimizers.items()}
+        facts |= {"step": done, "average": average if done else 0.0}
+        return WorkState({**tensors, "generator": generator.get_state()}, facts)
+
+    if (begun := kept.read()) is not None:
+        decoder.load_state_dict(named_tensors(begun.tensors, "decoder."))
+        for name, part in optimizers.items():
+            restore_optimizer(part, named_tensors(begun.tensors, f"{name}."), begun.facts[name])
+        generator.set_state(begun.tensors["generator"])
+        done = int(begun.facts["step"])
+        average = float(begun.facts["average"]) if done else math.nan
+    progress.skip(done, max(steps, 1))
+    with kept.kept(state) as now_and_then:
+        for step in range(done + 1, steps + 1):
+            with unbroken():
+                set_rate(optimizers, learning_rate(step, steps, *rates))
+                for optimizer in optimizers.values():
+                    optimizer.zero_grad(set_to_none=True)
+                loss = loss_of_step()
+                loss.backward()
+                for optimizer in optimizers.values():
+                    optimizer.step()
+                value = float(loss.detach())
+                require_finite({"loss": value}, f"{title}, step {step}")
+                average = value if math.isnan(average) else 0.95 * average + 0.05 * value
+                done = step
+            now_and_then()
+            progress(step, steps, loss=average)
     decoder.zero_grad(set_to_none=True)
 
 
@@ -236,14 +265,16 @@ def begin_prior_run(folder: Path, options: Json) -> Run:
             different = others if may_take_seed(run, old, new) else sorted({*others, "seed"})
         if different:
             raise CheckpointError(
-                f"{folder}: the run there was begun with other options: {', '.join(different)}\n"
-                "give the same ones to continue it, or name another folder with --folder"
+                f"{folder}: the run there was begun with other options: {', '.join(different)}",
+                "",
+                "give the same ones to continue it, or name another folder with `folder`",
             )
         return run
     if not is_empty(folder) and not is_unfinished_start(folder):
         raise CheckpointError(
-            f"{folder}: holds something that is no pre-training run, expected a new folder\n"
-            "name another with --folder"
+            f"{folder}: holds something that is no pre-training run, expected a new folder",
+            "",
+            "name another with `folder`",
         )
     make_folder(folder, RUN)
     run.checkpoints.mkdir(exist_ok=True)

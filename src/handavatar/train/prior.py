@@ -10,7 +10,6 @@ takes any abbreviation of its own options for itself: no option here may begin o
 
 import json
 import math
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,11 +18,12 @@ from typing import Any, get_args
 import torch
 from jaxtyping import Float
 from safetensors import safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from handavatar.avatar import CheckpointError
+from handavatar.errors import SEEDS, ArgumentError, argument, raise_if_refused, require_ranges
 from handavatar.evaluate.metrics import mask_iou
 from handavatar.field.decoders import Decoder, OccupancyField, untrained_field
 from handavatar.hand.open_hand import Level
@@ -31,7 +31,10 @@ from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
 from handavatar.hand.pose_sampling import resolve_penetration, sample_poses
 from handavatar.hand.rig import Rig
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.files import is_empty, refuse_file_in_use, write_atomically
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.signals import Interrupted, heard_signals, is_stopping, unbroken
 from handavatar.processes import Processes, joined_processes
 from handavatar.train.divergence import divergence_noted, take_seed
 from handavatar.train.labelled_poses import LabelledPose, PoseStream, labelled_pose
@@ -47,7 +50,6 @@ from handavatar.train.pretraining import (
 )
 from handavatar.train.runs import Run, append_log, locked, truncate_log
 from handavatar.train.stage_times import StageTimes
-from handavatar.train.stopping import Interrupted, stop_signals
 
 SHIPPED_PRIOR = Path(__file__).parent.parent / "assets" / "prior.safetensors"
 """Made in stages, each from the result of the last:
@@ -95,6 +97,7 @@ class PriorOptions:
         folder: for the log and checkpoints; what was begun there is continued.
         checkpoint_every: steps between two writings.
         device: where the networks run.
+        overwrite: replace a file at ``out``; what was begun in ``folder`` does so anyway.
     """
 
     out: Path = Path("prior.safetensors")
@@ -113,11 +116,25 @@ class PriorOptions:
     folder: Path | None = None
     checkpoint_every: int = 1000
     device: str = "cpu"
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            steps=(1, 10**8),
+            poses=(1, 1000),
+            points=(1, 10**6),
+            joint_points=(0, 10**6),
+            lr=(1e-12, 1),
+            final_lr=(1e-12, 1),
+            rounds=(0, 4),
+            seed=SEEDS,
+            checkpoint_every=(1, 10**8),
+        )
 
 
-def train_prior(
-    options: PriorOptions, report: Callable[[int, dict[str, float]], None] | None = None
-) -> OccupancyField:
+def train_prior(options: PriorOptions, progress: Progress = SILENT) -> OccupancyField:
     """Pre-trains the occupancy field and writes it.
 
     Started by ``torchrun``, the processes share the poses of every step and keep equal weights;
@@ -125,12 +142,13 @@ def train_prior(
 
     Args:
         options: see :class:`PriorOptions`.
-        report: called now and then with the step and the current figures: ``loss``,
-            ``samples_per_second`` (labelled points, of all processes together), and the share of
-            each stage of the first process's time, as ``share_...``; since the start of this call.
+        progress: told the steps done and the current figures: ``loss``, and ``samples`` a second
+            (labelled points, of all processes together). The log of ``folder`` has besides the
+            share of each stage of the first process's time, as ``share_...``.
 
     Raises:
         CheckpointError: if ``folder`` holds something else than a run with these options.
+        FolderInUse: if there is a file at ``out`` already.
         NotFinite: if a loss, a weight or an optimiser's state is no longer finite; it names what,
             in which step, and how to go on.
         Interrupted: after SIGINT or SIGTERM; a checkpoint was saved if there is a ``folder``.
@@ -139,25 +157,29 @@ def train_prior(
             joints with another decoder.
     """
     if options.joint_points and options.decoder != "pair":
-        raise ValueError(
-            f"prior: found {options.joint_points} points at joints for the decoder "
-            f"{options.decoder!r}; only 'pair' answers for two parts at once"
+        raise ArgumentError(
+            "joint_points",
+            f"{options.joint_points} for the decoder {options.decoder!r}",
+            "0: only 'pair' answers for two parts at once",
         )
+    is_begun = options.folder is not None and not is_empty(options.folder)
+    refuse_file_in_use(options.out, options.overwrite or is_begun)
     base = load_rig(options.rig, options.level)
-    with joined_processes(options.device) as processes, stop_signals() as stopped:
+    with joined_processes(options.device) as processes, heard_signals():
         if options.poses % processes.count:
-            raise ValueError(
-                f"prior: found {options.poses} poses a step for {processes.count} processes, "
-                "expected as many for each; give a multiple with --poses"
+            raise ArgumentError(
+                "poses",
+                f"{options.poses} a step for {processes.count} processes",
+                "as many for each: a multiple",
             )
         with ExitStack() as held:
             run = None
             if options.folder is not None and processes.is_first:
                 run = begin_prior_run(options.folder, _what_to_learn(options, base))
                 held.enter_context(locked(run))
-                begun, words = run.options["seed"], f"--folder {options.folder}"
+                begun, words = run.options["seed"], argument("folder", options.folder)
                 held.enter_context(divergence_noted(run, begun, options.seed, words))
-            return _trained(options, base, processes, run, stopped, report)
+            return _trained(options, base, processes, run, progress)
 
 
 def _trained(
@@ -165,8 +187,7 @@ def _trained(
     base: Rig,
     processes: Processes,
     run: Run | None,
-    stopped: Callable[[], bool],
-    report: Callable[[int, dict[str, float]], None] | None,
+    progress: Progress,
 ) -> OccupancyField:
     """The loop; ``run`` is the first process's alone."""
     torch.manual_seed(options.seed)
@@ -196,54 +217,62 @@ def _trained(
         if run.log.exists():
             truncate_log(run, done)
     written = 0
+    note = ""
+    progress.skip(done, options.steps)
     for step in range(done + 1, options.steps + 1):
-        first = (step - 1) * options.poses + processes.rank
-        own = range(first, step * options.poses, processes.count)
-        samples = [stream.drawn(number, times) for number in own]
-        set_rate(optimizers, learning_rate(step, options.steps, options.lr, options.final_lr))
-        field.zero_grad()
-        loss = loss_of(samples)
-        with times.stage("backward"):
-            loss.backward()
-        with times.stage("optimizer"):
-            torch.nn.utils.clip_grad_norm_(field.parameters(), 1.0)
-            for optimizer in optimizers.values():
-                optimizer.step()
-        value = float(loss.detach())
-        with times.stage("wait"):
-            is_stopped = processes.any(stopped())
-        is_last = step == options.steps or is_stopped
-        is_saved = step % options.checkpoint_every == 0 or is_last
-        values: dict[str, object] = {"loss": value, **field.state_dict()}
-        if is_saved:
-            values |= {name: optimizer_tensors(part) for name, part in optimizers.items()}
-        found = find_not_finite(values)
-        # All processes end, or those that found nothing would wait for the others for ever.
-        with times.stage("wait"):
-            if processes.any(found is not None):
-                found = found or "the loss of another process is not finite"
-                raise NotFinite(f"step {step}: {found}", _way_from(options, written))
-        average = value if math.isnan(average) else 0.99 * average + 0.01 * value
-        if processes.is_first and (step % 100 == 0 or is_last):
-            points = (step - done) * options.poses * options.points
-            figures = {"loss": average, "samples_per_second": points / times.seconds}
-            figures |= {f"share_{name}": share for name, share in times.shares().items()}
-            if report is not None:
-                report(step, figures)
-            if run is not None:
-                append_log(run, step, figures)
-        if processes.is_first and is_saved:
-            save_prior(field, options, base, step)
-            written = step
-            if run is not None:
-                save_progress(run, step, field, optimizers, average)
-        if is_stopped and step < options.steps:
-            way = (
-                f"continue with --folder {options.folder}"
-                if options.folder
-                else f"so far: {options.out}"
-            )
-            raise Interrupted(f"stopped at step {step}; {way}")
+        # The processes stop together: at the end of a step.
+        with unbroken():
+            first = (step - 1) * options.poses + processes.rank
+            own = range(first, step * options.poses, processes.count)
+            samples = [stream.drawn(number, times) for number in own]
+            set_rate(optimizers, learning_rate(step, options.steps, options.lr, options.final_lr))
+            field.zero_grad()
+            loss = loss_of(samples)
+            with times.stage("backward"):
+                loss.backward()
+            with times.stage("optimizer"):
+                torch.nn.utils.clip_grad_norm_(field.parameters(), 1.0)
+                for optimizer in optimizers.values():
+                    optimizer.step()
+            value = float(loss.detach())
+            with times.stage("wait"):
+                is_stopped = processes.any(is_stopping())
+            is_last = step == options.steps or is_stopped
+            is_saved = step % options.checkpoint_every == 0 or is_last
+            values: dict[str, object] = {"loss": value, **field.state_dict()}
+            if is_saved:
+                values |= {name: optimizer_tensors(part) for name, part in optimizers.items()}
+            found = find_not_finite(values)
+            # All processes end, or those that found nothing would wait for the others for ever.
+            with times.stage("wait"):
+                if processes.any(found is not None):
+                    found = found or "the loss of another process is not finite"
+                    raise NotFinite(f"step {step}: {found}", _way_from(options, written))
+            average = value if math.isnan(average) else 0.99 * average + 0.01 * value
+            if processes.is_first and (step % 100 == 0 or is_last):
+                points = (step - done) * options.poses * options.points
+                figures = {"loss": average, "samples_per_second": points / times.seconds}
+                figures |= {f"share_{name}": share for name, share in times.shares().items()}
+                shares = sorted(
+                    ((v, k[6:]) for k, v in figures.items() if k[:6] == "share_"), reverse=True
+                )
+                speed = f"{figures['samples_per_second']:,.0f} labelled points/s"
+                note = "; ".join([speed, *(f"{name} {share:.0%}" for share, name in shares)])
+                if run is not None:
+                    append_log(run, step, figures)
+            if processes.is_first and is_saved:
+                save_prior(field, options, base, step)
+                written = step
+                if run is not None:
+                    save_progress(run, step, field, optimizers, average)
+            if is_stopped and step < options.steps:
+                way = (
+                    f"{options.folder}: the same command goes on from there"
+                    if options.folder
+                    else f"so far: {options.out}"
+                )
+                raise Interrupted(f"stopped at step {step}; {way}")
+        progress(step, options.steps, note, loss=average)
     return field
 
 
@@ -251,10 +280,10 @@ def _way_from(options: PriorOptions, written: int) -> str:
     """What to do where there is no folder to go on in; the step of the file that was written."""
     again = "give the same command again with"
     if not written:
-        return f"{again} --seed {options.seed + 1}"
+        return f"{again} `seed={options.seed + 1}`"
     return (
         f"{options.out} holds the weights of step {written}, which are good\n"
-        f"{again} --start-from {options.out} --seed {options.seed + 1}"
+        f"{again} {argument('start_from', options.out)} `seed={options.seed + 1}`"
     )
 
 
@@ -286,11 +315,8 @@ def save_prior(field: OccupancyField, options: PriorOptions, rig: Rig, step: int
         "step": str(step),
         "options": json.dumps(record),
     }
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    aside = options.out.with_suffix(".tmp")
     state = {name: value.detach().cpu().contiguous() for name, value in field.state_dict().items()}
-    save_file(state, aside, metadata)
-    aside.replace(options.out)
+    write_atomically({options.out: save(state, metadata)})
 
 
 def load_prior(
@@ -311,17 +337,19 @@ def load_prior(
     if found != decoder:
         raise CheckpointError(
             f"{path} holds a prior with the decoder {found!r}, expected {decoder!r}: train one "
-            f"with `handavatar prior train --decoder {decoder}`"
+            f"with handavatar prior train {argument('decoder', decoder)}"
         )
     try:
         tensors = load_file(path)
         field.load_state_dict(tensors)
     except Exception as error:
+        raise_if_refused(error)
         raise CheckpointError(f"{path} is not a usable occupancy prior: {error}") from error
     if bad := find_not_finite(tensors):
         raise CheckpointError(
-            f"{path} is not a usable occupancy prior: {bad}\n"
-            "copy the file again, or leave it out: the prior that ships is good"
+            f"{path} is not a usable occupancy prior: {bad}",
+            "",
+            "copy the file again, or leave it out: the prior that ships is good",
         )
 
 
@@ -341,12 +369,14 @@ def _decoder_of(path: Path) -> Decoder:
     """Which decoder a file's weights are of; the first files did not say and hold PairOF."""
     if not path.is_file():
         raise CheckpointError(
-            f"no occupancy prior at {path}: train one with `handavatar prior train --out {path}`"
+            f"no occupancy prior at {path}: train one with handavatar prior train "
+            f"{argument('out', path)}"
         )
     try:
         with safe_open(path, framework="pt") as file:
             found = (file.metadata() or {}).get("decoder", "pair")
     except Exception as error:
+        raise_if_refused(error)
         raise CheckpointError(f"{path} is not a usable occupancy prior: {error}") from error
     for decoder in get_args(Decoder):
         if decoder == found:
@@ -376,6 +406,10 @@ class PriorEvaluationOptions:
     rig: str = "open-hand"
     level: Level = "full"
     rounds: int = POINT_ROUNDS
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, poses=(1, 10**5), points=(2, 10**6), rounds=(0, 4))
 
 
 def evaluate_prior(options: PriorEvaluationOptions) -> dict[str, float]:

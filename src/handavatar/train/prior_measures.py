@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from handavatar.errors import HandAvatarError
 from handavatar.evaluate.geometry import (
     Skin,
     Truth,
@@ -181,7 +182,7 @@ def measure_field(
     surface = extract_hand(occupancy_of, boxes, truth.hand, resolution)
     seconds = time.perf_counter() - start
     if len(surface.faces) == 0:
-        raise ValueError(
+        raise HandAvatarError(
             "the field has no surface: its occupancy is on one side of 0.5 at all "
             f"{surface.num_evaluations} samples; is the prior trained, and for this rig?"
         )

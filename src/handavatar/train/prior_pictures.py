@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 from PIL import Image, ImageDraw
 from torch import Tensor
 
+from handavatar.errors import HandAvatarError, require_ranges
 from handavatar.evaluate.geometry import Skin, Truth
 from handavatar.field.decoders import OccupancyField
 from handavatar.geometry.cameras import framing_camera
@@ -22,7 +23,7 @@ from handavatar.hand.pose_sampling import gesture_rotations
 from handavatar.hand.rig import PosedHand
 from handavatar.hand.rigs import load_rig
 from handavatar.hand.surface import extract_hand
-from handavatar.jobs.files import FolderKind, claim_folder
+from handavatar.jobs.files import FolderKind, claim_folder, write_aside
 from handavatar.render.shaded import shaded_mesh
 from handavatar.train.prior import SHIPPED_PRIOR, open_prior
 
@@ -73,6 +74,10 @@ class PriorPictureOptions:
     rounds: int = POINT_ROUNDS
     truth: bool = True
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, resolution=(2, 1024), size=(16, 4096), rounds=(0, 4))
+
 
 def picture_priors(options: PriorPictureOptions) -> list[Path]:
     """Writes a picture of each of ``POSES``.
@@ -105,9 +110,16 @@ def picture_priors(options: PriorPictureOptions) -> list[Path]:
         meshes = {}
         for name, field_of in fields.items():
             surface = extract_hand(field_of(hand), boxes, hand, options.resolution)
+            if len(surface.faces) == 0:
+                raise HandAvatarError(
+                    f"{name}: no surface is found at `resolution={options.resolution}`",
+                    "",
+                    "raise it; or is this no prior of this rig?",
+                )
             meshes[name] = (surface.vertices, surface.faces)
         path = options.out / f"{pose}.png"
-        Image.fromarray(side_by_side(meshes, hand.vertices, options.size)).save(path)
+        with write_aside(path) as aside:
+            Image.fromarray(side_by_side(meshes, hand.vertices, options.size)).save(aside)
         written.append(path)
     return written
 

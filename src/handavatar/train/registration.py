@@ -1,6 +1,6 @@
 """Poses and shape of a tracked capture, laid onto its frames before anything is learned."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -12,6 +12,8 @@ from handavatar.fit.energy import VIDEO_TEXTURE_SHARE
 from handavatar.fit.register import Registered, RegisterOptions
 from handavatar.geometry.rotations import nearest_rotations
 from handavatar.hand.pose import HandPose
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.stage_states import NOT_KEPT, StageState
 from handavatar.train.corrections import PoseCorrections
 
 _SHAPE_STEPS = 300
@@ -24,7 +26,8 @@ def register_training(
     corrections: PoseCorrections,
     frames: Sequence[Frame],
     options: RegisterOptions,
-    progress: Callable[[float], None] | None = None,
+    progress: Progress = SILENT,
+    kept: StageState = NOT_KEPT,
 ) -> Registered:
     """Gives an avatar that has not learned yet the shape, and its frames the poses, that fit.
 
@@ -35,14 +38,19 @@ def register_training(
         options: expected errors, rounds; frames of a video, which know their covariances, get the
             texture's weight of a video and few restarts.
         progress: told how far it is.
+        kept: where it goes on, if it was interrupted.
+
+    Raises:
+        Interrupted: if the command was told to stop.
     """
     if all(frame.covariance is not None for frame in frames):
         # Whoever knows these has looked for other poses already, and has drawn them to the texture.
         energy = replace(options.energy, texture_share=VIDEO_TEXTURE_SHARE)
         options = replace(options, restarts=min(options.restarts, _FEW_RESTARTS), energy=energy)
+    parts = progress.stages({"poses": 2.0 * len(frames), "offsets": 0.03 * _SHAPE_STEPS})
     rig = avatar.coarse_rig.to("cpu")
     hand = rig.shaped(avatar.coefficients.cpu())
-    found = register_frames([hand], frames, options, progress=progress)
+    found = register_frames([hand], frames, options, progress=parts["poses"], kept=kept)
     for number, (frame, pose) in enumerate(zip(frames, poses_of(found), strict=True)):
         rotations = nearest_rotations(pose.rotations, frame.pose.rotations)
         corrections.set(
@@ -51,12 +59,12 @@ def register_training(
             HandPose(rotations, pose.translation).to(avatar.device),
         )
     avatar.coefficients += found.shape_change.to(avatar.coefficients)
-    _fit_offsets(avatar, found)
+    _fit_offsets(avatar, found, parts["offsets"])
     return found
 
 
 @torch.enable_grad()
-def _fit_offsets(avatar: HandAvatar, found: Registered) -> None:
+def _fit_offsets(avatar: HandAvatar, found: Registered, progress: Progress) -> None:
     """Teaches the shape's network the skin that registration found, in all of its poses."""
     rest = avatar.coarse_rig.shaped(avatar.coefficients)
     target = found.hand.rest_vertices.to(avatar.device) - rest.rest_vertices
@@ -70,4 +78,5 @@ def _fit_offsets(avatar: HandAvatar, found: Registered) -> None:
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         optimizer.step()
+        progress(step + 1, _SHAPE_STEPS)
     optimizer.zero_grad(set_to_none=True)

@@ -2,6 +2,7 @@
 
 ```
 run/  options.json  run.json  seeds.json  log.jsonl  avatar.safetensors  .lock  .handavatar
+      {geometry,samples,detail}.unfinished[.stage].safetensors
       checkpoints/step-000001000/{model,optimizer}.safetensors  state.json  MANIFEST.json
       corrupt/  evaluation/  renders/
 ```
@@ -14,17 +15,14 @@ can execute what it reads.
 """
 
 import errno
-import fcntl
 import json
 import logging
 import os
 import re
 import shutil
-import socket
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from hashlib import sha256
@@ -36,28 +34,30 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from handavatar.avatar import CheckpointError
+from handavatar.errors import raise_if_refused
 from handavatar.jobs.files import (
     MARKER,
-    FolderInUse,
     FolderKind,
     is_empty,
     mark_folder,
+    put_in_place,
     read_marker,
-    refuse_folder_in_use,
-    swap_folder,
+    write_atomically,
 )
 from handavatar.jobs.finite import find_not_finite, require_finite
+from handavatar.jobs.locks import LockHeld, hold_lock
 from handavatar.train.provenance import package_versions, source_commit
 
 Json = dict[str, Any]
 
 _SCHEMA = 1
+LOCK = ".lock"
+"""Its name in the run's folder."""
 _KEPT_CHECKPOINTS = 3
 _MANIFEST = "MANIFEST.json"
 _STATE = "state.json"
 _STEP_FOLDER = re.compile(r"step-(\d{9,})")
 _FILE_NAME = re.compile(r"[a-z][a-z0-9_]*\.(safetensors|json)")
-_ENDINGS = ("safetensors", "json")
 _MAX_MANIFEST_BYTES = 1 << 20
 
 _log = logging.getLogger(__name__)
@@ -72,17 +72,10 @@ def _is_older_run(folder: Path) -> bool:
     return {"schema", "versions", "seed", "capture", "command"} <= facts.keys()
 
 
-RUN = FolderKind(
-    "run",
-    (
-        *("options.json", "run.json", "seeds.json", "log.jsonl", "avatar.safetensors", ".lock"),
-        *(f"{kept}/step-*/*.{end}" for kept in ("checkpoints", "corrupt") for end in _ENDINGS),
-        *(f"live/{name}" for name in ("avatar.safetensors", "progress.json", "watched")),
-        *(f"evaluation/{name}" for name in (MARKER, "*.png", "metrics.json", "report.html")),
-    ),
-    _is_older_run,
-)
-"""The folder that :func:`create_run` makes. What was rendered into it is not listed: it stays."""
+UNFINISHED_STAGES = ("geometry.unfinished", "samples.unfinished", "detail.unfinished")
+"""Files of a run, without their endings, in which stages between checkpoints keep their state."""
+RUN = FolderKind("run", is_older=_is_older_run)
+"""The folder that :func:`create_run` makes."""
 
 
 @dataclass(frozen=True)
@@ -151,8 +144,9 @@ class CheckpointContents:
 
 
 def default_run_folder(capture: Path, method: str, outputs: Path = Path("outputs")) -> Path:
-    """``outputs/{capture}/{method}/{time}``, local time to the second."""
-    return outputs / capture.resolve().name / method / datetime.now().strftime("%Y-%m-%d_%H%M%S")
+    """``outputs/{capture}/{method}/{time}``, local time to the second; always in UTF-8."""
+    name = capture.resolve().name.encode("utf-8", "replace").decode().replace("?", "_")
+    return outputs / name / method / datetime.now().strftime("%Y-%m-%d_%H%M%S")
 
 
 def interrupted_run_folder(
@@ -195,7 +189,6 @@ def create_run(
     capture: Path,
     capture_sha256: str,
     perceptual: str,
-    overwrite: bool = False,
 ) -> Run:
     """Makes the folder with ``options.json`` and ``run.json``.
 
@@ -206,8 +199,6 @@ def create_run(
         capture: folder of the capture.
         capture_sha256: fingerprint of the capture's files.
         perceptual: the perceptual loss in use, ``lpips-vgg`` or the substitute's name.
-        overwrite: replace the run that lies there, unless it is being trained or holds files that
-            no training writes; a folder that is no run is never touched.
 
     Raises:
         CheckpointError: if the folder holds something already.
@@ -222,39 +213,19 @@ def create_run(
         "perceptual": perceptual,
         "started": datetime.now().astimezone().isoformat(timespec="seconds"),
     }
-    try:
-        if is_empty(folder) or is_unfinished_start(folder):
-            _write_start(folder, options, facts)
-        elif overwrite and (folder / "run.json").is_file():
-            _replace_run(folder, options, facts, capture)
-        else:
-            raise FolderInUse(f"{folder}: not empty", "")
-    except FolderInUse as error:
+    if not is_empty(folder) and not is_unfinished_start(folder):
         raise CheckpointError(
-            f"{error.found}, expected a new folder\n"
-            "name another with --out, or continue the run that is there with --resume auto"
-        ) from error
-    return Run(folder)
-
-
-def _write_start(folder: Path, options: Json, facts: Json) -> None:
+            f"{folder}: not empty, expected a new folder",
+            "",
+            "name another with `out`, or continue the run that is there with `resume='auto'`",
+        )
+    run = Run(folder)
     folder.mkdir(parents=True, exist_ok=True)
     mark_folder(folder, RUN)
-    Run(folder).checkpoints.mkdir(exist_ok=True)
+    run.checkpoints.mkdir(exist_ok=True)
     write_json(folder / "options.json", options)
     write_json(folder / "run.json", facts)
-
-
-def _replace_run(folder: Path, options: Json, facts: Json, capture: Path) -> None:
-    """Puts the start of a run in the place of another one, which nobody may be training."""
-    refuse_folder_in_use(folder, RUN, True, (capture,))
-    with tempfile.TemporaryDirectory(
-        prefix=f".{folder.name}.", suffix=".part", dir=folder.absolute().parent
-    ) as beside:
-        whole = Path(beside) / folder.name
-        _write_start(whole, options, facts)
-        with locked(Run(folder)):
-            swap_folder(whole, folder, RUN, True, (capture,))
+    return run
 
 
 def is_unfinished_start(folder: Path) -> bool:
@@ -281,8 +252,9 @@ def open_run(folder: Path) -> Run:
     """
     if not (folder / "run.json").is_file():
         raise CheckpointError(
-            f"{folder}: no run.json in it, so it is not a run folder\n"
-            "give the folder that handavatar train printed, under outputs/"
+            f"{folder}: no run.json in it, so it is not a run folder",
+            "",
+            "give the folder that handavatar train printed, under outputs/",
         )
     return Run(folder)
 
@@ -294,31 +266,22 @@ def locked(run: Run) -> Iterator[None]:
     Raises:
         CheckpointError: if another process holds it.
     """
-    with open(run.folder / ".lock", "a+", encoding="utf-8") as file:
+    with ExitStack() as held:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            file.seek(0)
-            holder = file.read(200).strip() or "another process"
+            held.enter_context(hold_lock(run.folder / LOCK))
+        except LockHeld as error:
             raise CheckpointError(
-                f"{run.folder}: {holder} is writing this run\n"
-                "wait until it has ended or stop it, or train into another folder with --out"
+                f"{run.folder}: {error.found} is writing this run",
+                "",
+                "wait until it has ended or stop it, or train into another folder with `out`",
             ) from error
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}")
-        file.flush()
         yield
 
 
 def write_json(path: Path, value: Json) -> None:
     """Replaces a JSON file in one step; NaN is refused."""
     text = json.dumps(value, indent=2, allow_nan=False) + "\n"
-    aside = path.with_name(f".tmp-{os.getpid()}-{path.name}")
-    try:
-        _write_synced(aside, text.encode())
-        aside.replace(path)
-    finally:
-        aside.unlink(missing_ok=True)
+    write_atomically({path: text.encode()})
 
 
 # --- the log --------------------------------------------------------------------------------------
@@ -339,12 +302,7 @@ def read_log(run: Run) -> list[Json]:
 def truncate_log(run: Run, step: int) -> None:
     """Forgets what was logged after ``step``, so that a resumed log equals an uninterrupted one."""
     kept = b"".join(line for line, record in _log_lines(run) if record["step"] <= step)
-    aside = run.log.with_name(f".tmp-{os.getpid()}-log.jsonl")
-    try:
-        _write_synced(aside, kept)
-        aside.replace(run.log)
-    finally:
-        aside.unlink(missing_ok=True)
+    write_atomically({run.log: kept})
 
 
 def _log_lines(run: Run) -> Iterator[tuple[bytes, Json]]:
@@ -406,13 +364,9 @@ def save_checkpoint(
     try:
         aside.mkdir()
         for name, data in payloads.items():
-            _write_synced(aside / name, data)
-        _write_synced(aside / _MANIFEST, manifest)
-        _sync_folder(aside)
-        if final.exists():
-            final.rename(run.checkpoints / f".tmp-{os.getpid()}-{step}-replaced")
-        aside.rename(final)
-        _sync_folder(run.checkpoints)
+            (aside / name).write_bytes(data)
+        (aside / _MANIFEST).write_bytes(manifest)
+        put_in_place(aside, final)
     finally:
         shutil.rmtree(aside, ignore_errors=True)
     _remove_leftovers(run)
@@ -456,6 +410,7 @@ def load_checkpoint(checkpoint: Checkpoint) -> CheckpointContents:
             else:
                 tensors[path.stem] = safetensors.torch.load(data)
         except (ValueError, RecursionError, SafetensorError) as error:
+            raise_if_refused(error)
             raise _broken(path, f"cannot be read ({error})") from error
     if found := find_not_finite({**tensors, "state": state}):
         raise _broken(checkpoint.folder, f"cannot be gone on from: {found}")
@@ -481,8 +436,9 @@ def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
         raise _broken(path, "is not a manifest (cut or overwritten)") from error
     if schema > _SCHEMA:
         raise CheckpointError(
-            f"{path}: written by a newer version (schema {schema}, this one knows {_SCHEMA})\n"
-            "update handavatar, or train again with this version"
+            f"{path}: written by a newer version (schema {schema}, this one knows {_SCHEMA})",
+            "",
+            "update handavatar, or train again with this version",
         )
     if step != checkpoint.step or _STATE not in files:
         raise _broken(path, f"does not belong to step {checkpoint.step}")
@@ -495,6 +451,7 @@ def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
             found = member.stat().st_size
             data = member.read_bytes() if found == size else b""
         except OSError as error:
+            raise_if_refused(error)
             raise _broken(member, f"cannot be read ({error.strerror})") from error
         if found != size:
             raise _broken(member, f"has {found} bytes, the manifest says {size}")
@@ -506,8 +463,9 @@ def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
 
 def _broken(path: Path, what: str) -> CheckpointError:
     return CheckpointError(
-        f"{path}: {what}\n"
-        "continue from the newest whole checkpoint with --resume auto, or train again"
+        f"{path}: {what}",
+        "",
+        "continue from the newest whole checkpoint with `resume='auto'`, or train again",
     )
 
 
@@ -540,21 +498,6 @@ def _require_free_space(folder: Path, num_bytes: int) -> None:
         raise OSError(
             errno.ENOSPC, f"a checkpoint needs {num_bytes} bytes free, found {free}", str(folder)
         )
-
-
-def _write_synced(path: Path, data: bytes) -> None:
-    with open(path, "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def read_json(path: Path, remedy: str) -> Json:

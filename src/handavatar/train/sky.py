@@ -16,6 +16,9 @@ from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
 from handavatar.field.anchors import Neighbours
 from handavatar.jobs.finite import require_finite
+from handavatar.jobs.progress import SILENT, Progress
+from handavatar.jobs.signals import stop_point
+from handavatar.jobs.stage_states import NOT_KEPT, StageState, WorkState
 from handavatar.jobs.threads import mapped
 from handavatar.render.skylight import even_directions
 from handavatar.render.volume import composite_sparse
@@ -28,10 +31,17 @@ _LATTICE = 512
 _BLUR = 0.25
 """Radians by which the rough sky is blurred before they are chosen."""
 _STEPS, _PIXELS, _RATE = 150, 4096, 5e-2
+_AT_ONCE = 8
+"""Frames whose light is traced before it is told."""
 
 
 def place_directions(
-    avatar: HandAvatar, frames: list[Frame], seen: SeenSamples, seed: int
+    avatar: HandAvatar,
+    frames: list[Frame],
+    seen: SeenSamples,
+    seed: int,
+    progress: Progress = SILENT,
+    kept: StageState = NOT_KEPT,
 ) -> SeenSamples:
     """Moves the avatar's directions of light to where the light is.
 
@@ -40,16 +50,20 @@ def place_directions(
         frames: of training, their poses as training sees them.
         seen: of these frames, with the light from the even directions.
         seed: of the pixels that are looked at.
+        progress: told how far it is.
+        kept: where it goes on, if it was interrupted.
 
     Returns:
         The same samples with the light from the new directions.
     """
     directions = avatar.illumination.directions
-    skies = [
-        fit_sky(seen, len(avatar.anchor_corners), seed, clip) for clip in range(avatar.num_lights)
-    ]
+    parts = progress.stages({"sky": 8.0 * avatar.num_lights, "tracing light": 1.7 * len(frames)})
+    skies = []
+    for clip in range(avatar.num_lights):
+        skies.append(fit_sky(seen, len(avatar.anchor_corners), seed, clip))
+        parts["sky"](clip + 1, avatar.num_lights)
     directions.copy_(bright_directions(directions, _joined_skies(skies)))
-    return relit(avatar, frames, seen)
+    return relit(avatar, frames, seen, parts["tracing light"], kept)
 
 
 @torch.enable_grad()
@@ -79,6 +93,7 @@ def fit_sky(
     grey = seen.colors.mean(-1)
     own = (seen.clips[seen.frames[seen.starts[:-1]]] == clip).nonzero()[:, 0]
     for _ in range(_STEPS):
+        stop_point()
         pixels = own[torch.randint(len(own), (_PIXELS,), generator=generator).to(device)]
         sample, ray = chosen_samples(seen, pixels)
         neighbours = Neighbours(seen.neighbours.indices[sample], seen.neighbours.weights[sample])
@@ -114,8 +129,22 @@ def bright_directions(
 
 
 @torch.no_grad()
-def relit(avatar: HandAvatar, frames: list[Frame], seen: SeenSamples) -> SeenSamples:
-    """The same samples with the light from the avatar's directions as they are now."""
+def relit(
+    avatar: HandAvatar,
+    frames: list[Frame],
+    seen: SeenSamples,
+    progress: Progress = SILENT,
+    kept: StageState = NOT_KEPT,
+) -> SeenSamples:
+    """The same samples with the light from the avatar's directions as they are now.
+
+    Args:
+        avatar: that knows the directions.
+        frames: of training, their poses as training sees them.
+        seen: of these frames.
+        progress: told how many frames are done.
+        kept: where it goes on, if it was interrupted.
+    """
 
     def light_of(number: int) -> Tensor:
         state = avatar.prepare(frames[number].pose.to(avatar.device))
@@ -123,4 +152,17 @@ def relit(avatar: HandAvatar, frames: list[Frame], seen: SeenSamples) -> SeenSam
         neighbours = Neighbours(seen.neighbours.indices[mine], seen.neighbours.weights[mine])
         return neighbours.interpolated(state.light).half()
 
-    return replace(seen, light=torch.cat(mapped(light_of, range(len(frames)))))
+    light: list[Tensor] = []
+    if (begun := kept.read()) is not None:
+        count = int(begun.facts["frames"])
+        light = [begun.tensors[str(number)].to(avatar.device) for number in range(count)]
+    progress.skip(len(light), len(frames))
+
+    def state() -> WorkState:
+        return WorkState({str(n): v for n, v in enumerate(light)}, {"frames": len(light)})
+
+    with kept.kept(state):
+        for some in torch.arange(len(light), len(frames)).split(_AT_ONCE):
+            light += mapped(light_of, some.tolist())
+            progress(len(light), len(frames))
+    return replace(seen, light=torch.cat(light))

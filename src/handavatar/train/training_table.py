@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from handavatar.avatar import EXACT, HandAvatar, HandState, RayValues, RenderSettings
+from handavatar.errors import require_range, require_ranges
 from handavatar.evaluate.speed_table import hand_camera
 from handavatar.evaluate.tables import Cell, ResultTable, step_counter
 from handavatar.field.occupancy import BOX_MARGIN, PairOccupancy, hand_codes
@@ -22,6 +23,7 @@ from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.parts import POINT_ROUNDS, Parts, finer_rig
 from handavatar.hand.pose import HandPose
 from handavatar.hand.pose_sampling import gesture_rotations
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.plain import plain_rays
 from handavatar.train.labelled_poses import LabelledPose, PoseStream
 from handavatar.train.loop import learned_rays
@@ -54,6 +56,17 @@ class TrainingTableOptions:
     steps: int = 8
     points: int = 1024
 
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(
+            self,
+            patch=(1, _PICTURE),
+            samples=(1, 4096),
+            plain_rays=(1, 10**6),
+            steps=(1, 10**6),
+            points=(1, 10**6),
+        )
+
     @property
     def total_steps(self) -> int:
         """The patch three times, and the steps both ways."""
@@ -75,25 +88,19 @@ class PatchCost:
     gradients: dict[str, Tensor]
 
 
-def training_table(
-    options: TrainingTableOptions, report: Callable[[int], None] | None = None
-) -> ResultTable:
+def training_table(options: TrainingTableOptions, progress: Progress = SILENT) -> ResultTable:
     """Measures a patch and a step of pre-training, each in the plain way and in ours.
 
     Args:
         options: what to measure.
-        report: told the number of pieces of work done.
+        progress: told the number of pieces of work done.
 
     Raises:
         CheckpointError: if the avatar cannot be read.
-        ValueError: if the patch does not fit, or has fewer rays than the plain way shall take.
+        ArgumentError: if the patch does not fit, or has fewer rays than the plain way shall take.
     """
-    if not 1 <= options.patch <= _PICTURE or not 1 <= options.plain_rays <= options.patch**2:
-        raise ValueError(
-            f"training table: found a patch of {options.patch} pixels and {options.plain_rays} "
-            f"plain rays, expected 1 to {_PICTURE} pixels and at most as many rays as it has"
-        )
-    finished = step_counter(report)
+    require_range("plain_rays", options.plain_rays, 1, options.patch**2)
+    finished = step_counter(progress, options.total_steps)
     rows = _patch_rows(options, finished)
     plain, ours = _step_seconds(options, finished)
     rows["pre-training step, plain"] = {"s": round(plain, 3), "ratio": 1.0, **_NOTHING}

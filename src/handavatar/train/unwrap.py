@@ -14,6 +14,7 @@ from torch.nn.functional import max_pool2d, normalize
 from handavatar.geometry.cameras import Camera, project
 from handavatar.geometry.meshes import face_cross_products
 from handavatar.geometry.rotations import invert_rigid
+from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.threads import mapped
 from handavatar.render.chart import Texels
 from handavatar.render.rasterize import rasterize
@@ -87,6 +88,7 @@ def unwrap_pictures(
     faces: Int[Tensor, "faces 3"],
     texels: Texels,
     corners: Float[Tensor, "faces 3 2"],
+    progress: Progress = SILENT,
 ) -> Unwrapped:
     """The residual of every texel, from all pictures.
 
@@ -99,6 +101,7 @@ def unwrap_pictures(
         faces: of the fine mesh.
         texels: of its chart.
         corners: of the faces on the chart, (u, v).
+        progress: told how far it is.
 
     Departs: the paper has no texture; mean values of frames that are a pixel off are blurred,
         medians less so.
@@ -138,7 +141,8 @@ def unwrap_pictures(
         return weighted_median(values, weights), total
 
     windows = [slice(at, at + _TEXELS_AT_ONCE) for at in range(0, count, _TEXELS_AT_ONCE)]
-    for window, (value, total) in zip(windows, mapped(median_of, windows), strict=True):
+    medians = mapped(median_of, windows, progress=progress)
+    for window, (value, total) in zip(windows, medians, strict=True):
         is_seen = total > _LEAST
         seen[window] = torch.where(is_seen, total, 0.0)
         residual[window] = torch.where(is_seen[:, None], value.clamp(-_LARGEST, _LARGEST), 0.0)

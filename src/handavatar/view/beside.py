@@ -11,7 +11,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from handavatar.avatar import HandAvatar
-from handavatar.train.stopping import stop_signals
+from handavatar.jobs.signals import awaited_signals
 from handavatar.view.server import ViewServer, checked_guard, greeting, keep_serving, serving
 from handavatar.view.studio import Studio
 from handavatar.view.training import Watch
@@ -53,8 +53,8 @@ class Beside:
         if self._process.is_alive():
             print("the page goes over to the avatar; Ctrl-C ends it", file=sys.stderr, flush=True)
         # Noted, not raised: where a shell has begun this in the background, Ctrl-C is ignored else.
-        with stop_signals() as stopped:
-            while self._process.is_alive() and not stopped():
+        with awaited_signals() as is_stopped:
+            while self._process.is_alive() and not is_stopped():
                 self._process.join(_LOOK_EVERY)
 
 

@@ -8,14 +8,15 @@ import socketserver
 import sys
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 from typing import Any, Protocol
 from urllib.parse import parse_qs, urlsplit
 
+from handavatar.errors import ArgumentError, HandAvatarError, machine_error
 from handavatar.view.guard import POSTED_KINDS, Guard, Refused
+from handavatar.view.limits import Connections, Limits
 from handavatar.view.scene import SceneError
 from handavatar.view.studio import MOST_PICTURE_BYTES, Interrupted
 from handavatar.view.turns import Busy, Overtaken
@@ -26,7 +27,6 @@ MOST_CAMERA_BYTES = 1 << 20
 """Of a camera's picture."""
 MOST_PIECE_BYTES = 4 << 20
 """Of a piece of a recording."""
-MOST_CONNECTIONS = 160
 MOST_PICTURES = 2
 """Pictures that are being received or read at a time; more are asked to try again."""
 MOST_PORTS = 20
@@ -106,8 +106,7 @@ class HttpServer(ThreadingHTTPServer):
     def __init__(self, address: tuple[str, int]) -> None:
         """Binds the port; before it serves, it must be given its guard and its answers."""
         self.pictures = threading.BoundedSemaphore(MOST_PICTURES)
-        self._free = threading.BoundedSemaphore(MOST_CONNECTIONS)
-        self._open: set[socket.socket] = set()
+        self.connections = Connections(Limits())
         super().__init__(address, _Handler)
 
     def server_bind(self) -> None:
@@ -115,27 +114,19 @@ class HttpServer(ThreadingHTTPServer):
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
+    def service_actions(self) -> None:
+        """Several times a second, while it serves."""
+        self.connections.end_late()
+
     def process_request(self, request: Any, client_address: Any) -> None:
-        """A thread for a connection, while there are places."""
-        if self._free.acquire(blocking=False):
-            self._open.add(request)
-            super().process_request(request, client_address)
-        else:
-            self.shutdown_request(request)
+        """A thread for a connection, which has to say soon what it wants."""
+        self.connections.expect_head(request, str(client_address[0]))
+        super().process_request(request, client_address)
 
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        """All that comes on a connection."""
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self._open.discard(request)
-            self._free.release()
-
-    def hang_up(self) -> None:
-        """Ends the connections that are open; what waits for an answer gets none."""
-        for connection in list(self._open):
-            with suppress(OSError):
-                connection.shutdown(socket.SHUT_RDWR)
+    def shutdown_request(self, request: Any) -> None:
+        """Closes a connection."""
+        self.connections.forget(request)
+        super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """A connection that broke; what a request asked for never ends here."""
@@ -158,6 +149,11 @@ class _Handler(BaseHTTPRequestHandler):
     disable_nagle_algorithm = True
     server: HttpServer
 
+    def handle_one_request(self) -> None:
+        """Waits for a request, and answers it."""
+        self.server.connections.expect_head(self.connection, str(self.client_address[0]))
+        super().handle_one_request()
+
     def do_GET(self) -> None:
         self._answer(self._got)
 
@@ -167,6 +163,17 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, make: Callable[[], Answer]) -> None:
         try:
             self.server.guard.check(self.command, self.path, self.headers)
+            with self.server.connections.place(self.connection):
+                self._answer_let_in(make)
+            return
+        except Refused as error:
+            answer = self._failure(error.status, str(error))
+        except Busy:
+            answer = self._failure(503, "too many ask at once: try again")
+        self._send(answer)
+
+    def _answer_let_in(self, make: Callable[[], Answer]) -> None:
+        try:
             answer = make()
         except Refused as error:
             answer = self._failure(error.status, str(error))
@@ -180,8 +187,10 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
             return
         except Exception as error:  # one answer fails, the server goes on
-            print(f"view: {type(error).__name__}: {str(error)[:200]}", file=sys.stderr)
-            answer = self._failure(500, f"{type(error).__name__}: {str(error)[:200]}")
+            known = error if isinstance(error, HandAvatarError) else machine_error(error)
+            said = str(known)[:400] if known else f"{type(error).__name__}: {str(error)[:200]}"
+            print(f"view: {said}", file=sys.stderr)
+            answer = self._failure(500, said)
         self._send(answer)
 
     def _got(self) -> Answer:
@@ -217,7 +226,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _posted_whole(self, length: int, most: int) -> Answer:
         if length > most:
             raise Refused(413, f"at most {most} bytes")
-        body = self.rfile.read(length)
+        with self.server.connections.body(self.connection, length):
+            body = self.rfile.read(length)
         if len(body) < length:
             raise ConnectionResetError
         return self.server.answers.post(self.path, body, self._is_gone)
@@ -255,7 +265,7 @@ def bound(host: str, port: int) -> HttpServer:
         port: the first to try; 0 is any.
 
     Raises:
-        OSError: if no port is free, or there is no such host.
+        ArgumentError: if no port is free, or there is no such host.
     """
     kind = _HttpServer6 if ":" in host else HttpServer
     last = min(port + MOST_PORTS, 65536) - 1 if port else 0
@@ -264,6 +274,9 @@ def bound(host: str, port: int) -> HttpServer:
             return kind((host, candidate))
         except OSError as error:
             if error.errno != errno.EADDRINUSE or candidate == last:
-                where = f"--host {host} --port {candidate}"
-                raise OSError(error.errno, f"{error.strerror}: choose another", where) from error
+                is_port = error.errno in (errno.EADDRINUSE, errno.EACCES)
+                found = f"{candidate if is_port else host}: {error.strerror}"
+                raise ArgumentError(
+                    "port" if is_port else "host", found, "", "choose another"
+                ) from error
     raise AssertionError("the last port returns or raises")

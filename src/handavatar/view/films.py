@@ -116,15 +116,11 @@ class Films:
     def _make(self, film: _Film, order: FilmOrder, steps: range, fps: float) -> None:
         try:
             size = order.scene.size
-            writer = VideoWriter(
-                film.path, fps, min(size, FLUID_SIZE) if order.stage == STAGES[0] else size
-            )
-            try:
+            shown = min(size, FLUID_SIZE) if order.stage == STAGES[0] else size
+            with VideoWriter(film.path, fps, shown) as writer:
                 for number, step in enumerate(steps):
                     writer.add(self._frame(film, order, number, step))
                     film.done = number + 1
-            finally:
-                writer.close()
             film.state = "finished"
         except (Overtaken, Interrupted):
             film.state, film.why = "cancelled", "nobody asked for it any more"

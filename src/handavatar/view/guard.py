@@ -14,6 +14,8 @@ from email.message import Message
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import parse_qs, urlsplit
 
+from handavatar.errors import ArgumentError
+
 LOOPBACK_NAMES = frozenset({"localhost", "127.0.0.1", "::1"})
 JSON_KIND = "application/json"
 POSTED_KINDS = {
@@ -104,7 +106,7 @@ def guard_of(host: str, token: str) -> Guard:
         or not token.replace("-", "").replace("_", "").isalnum()
         or not token.isascii()
     ):
-        raise ValueError("--token: expected letters, digits, - and _, at most 200")
+        raise ArgumentError("token", "others, or too many", "letters, digits, - and _, at most 200")
     if is_loopback(host):
         return Guard(host, token)
     own = frozenset(name.lower() for name in (host, socket.gethostname()))

@@ -11,6 +11,7 @@ from typing import Any
 
 from handavatar.capture.frames import MAX_CLIPS
 from handavatar.edit import bones_named
+from handavatar.errors import HandAvatarError
 from handavatar.hand.pose import FINGER_BONES, NUM_BONES
 
 LAYERS = ("rgb", "albedo", "illumination", "normal", "mesh")
@@ -23,7 +24,7 @@ MOST_ANCHORS = 1_000_000
 _NAME_LENGTH = 40
 
 
-class SceneError(ValueError):
+class SceneError(HandAvatarError):
     """A page sent what is no scene: what was found and what was expected."""
 
 

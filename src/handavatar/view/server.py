@@ -6,7 +6,6 @@ and the pictures that it has sent as paint.
 """
 
 import os
-import signal
 import socket
 import sys
 import threading
@@ -21,7 +20,10 @@ import torch
 
 from handavatar.avatar import HandAvatar, RenderSettings, chosen_device
 from handavatar.capture.motion import MOTIONS, Motion, read_motion
+from handavatar.errors import require_range, require_ranges
 from handavatar.field.kernels import Kernel, chosen_kernel
+from handavatar.jobs.signals import awaited_signals
+from handavatar.jobs.threads import step_back
 from handavatar.train.live import read_live
 from handavatar.train.runs import Run
 from handavatar.view.answers import AvatarAnswers
@@ -42,7 +44,6 @@ _SHARE = 0.04
 """Of all cores together, for a page beside a training, be the cores idle or not."""
 _LOOK_EVERY = 1.0
 """Seconds between two looks at a training."""
-_STOPPING = (signal.SIGINT, signal.SIGTERM)
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,10 @@ class ViewOptions:
     out: Path = Path("edited")
     device: str = "auto"
     kernel: Kernel = "auto"
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, port=(0, 65_535))
 
 
 class PageServer:
@@ -108,7 +113,7 @@ class PageServer:
         """Stops answering and frees the port."""
         self._http.shutdown()
         self._http.server_close()
-        self._http.hang_up()
+        self._http.connections.end_all()
 
 
 Served = TypeVar("Served", bound=PageServer)
@@ -166,9 +171,9 @@ class ViewServer(PageServer):
 
 
 def _step_back() -> None:
-    """Leaves the cores to others, in a lane's thread: a priority is a thread's own on Linux."""
+    """Leaves the cores to others, in a lane's thread."""
     torch.set_num_threads(1)
-    os.nice(_LOW_PRIORITY)
+    step_back(_LOW_PRIORITY)
 
 
 def _end(turns: Turns, films: Films | None) -> None:
@@ -210,24 +215,9 @@ def view(options: ViewOptions) -> None:
     shown = Watch(options.run) if live is not None and live.is_going_on else studio()
     server = ViewServer(shown, guard, options.port, options.out)
     greet(server, options.port)
-    with stopping() as is_stopped, serving(server):
+    with awaited_signals() as is_stopped, serving(server):
         print("Ctrl-C ends it", flush=True)
         keep_serving(server, shown, studio, is_stopped)
-
-
-@contextmanager
-def stopping() -> Iterator[Callable[[], bool]]:
-    """Whether SIGINT or SIGTERM has come, as long as the block lasts; for the main thread.
-
-    An exception out of a signal can be lost wherever Python swallows exceptions.
-    """
-    is_stopped: list[int] = []
-    before = [signal.signal(kind, lambda *_: is_stopped.append(1)) for kind in _STOPPING]
-    try:
-        yield lambda: bool(is_stopped)
-    finally:
-        for kind, handler in zip(_STOPPING, before, strict=True):
-            signal.signal(kind, handler)
 
 
 def checked_guard(host: str, port: int, token: str) -> Guard:
@@ -236,8 +226,7 @@ def checked_guard(host: str, port: int, token: str) -> Guard:
     Raises:
         ValueError: for a port or token that cannot be.
     """
-    if not 0 <= port < 65536:
-        raise ValueError(f"--port {port}: expected 0 to 65535")
+    require_range("port", port, 0, 65535)
     return guard_of(host, token)
 
 

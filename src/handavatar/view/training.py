@@ -149,6 +149,7 @@ class Watch:
             "step": state.step,
             "total": state.total,
             "steps_per_second": state.steps_per_second,
+            "share": state.share,
             "seconds_left": state.seconds_left,
             "figures": state.figures,
             "frames": len(self._numbers),

@@ -11,12 +11,14 @@ from pathlib import Path
 from typing import Literal
 
 from handavatar.avatar import HandAvatar
+from handavatar.errors import require_ranges
 from handavatar.hand.rigs import load_rig
+from handavatar.jobs.signals import awaited_signals
 from handavatar.tracker.model import shipped_tracker
 from handavatar.view.driven import DrivenAvatar
 from handavatar.view.guard import Guard
 from handavatar.view.recording import RecordingFile
-from handavatar.view.server import PageServer, checked_guard, greet, serving, stopping
+from handavatar.view.server import PageServer, checked_guard, greet, serving
 from handavatar.view.webcam_answers import WebcamAnswers
 from handavatar.webcam.session import LiveSession
 
@@ -50,6 +52,10 @@ class WebcamOptions:
     port: int = 7007
     host: str = "127.0.0.1"
     token: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        require_ranges(self, focal_share=(0.05, 50), longest=(0.1, 1e6), port=(0, 65_535))
 
 
 class WebcamServer(PageServer):
@@ -108,7 +114,7 @@ def record_webcam(options: WebcamOptions) -> Path | None:
     answers = webcam_answers(options)
     server = WebcamServer(answers, guard, options.port)
     greet(server, options.port)
-    with stopping() as is_stopped, serving(server):
+    with awaited_signals() as is_stopped, serving(server):
         if options.out is None:
             print("the avatar follows the hand; Ctrl-C ends it", flush=True)
         else:

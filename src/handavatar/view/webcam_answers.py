@@ -2,7 +2,6 @@
 
 import base64
 import io
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -14,6 +13,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from handavatar.capture.checks import CaptureError, decoded, picture_in
+from handavatar.jobs.threads import step_back
 from handavatar.view.answers import client_in, order_in
 from handavatar.view.connections import MOST_PIECE_BYTES, Answer, json_answer, page_file
 from handavatar.view.driven import DrivenAvatar
@@ -184,7 +184,7 @@ class WebcamAnswers:
         """Leaves the cores to the browser, once in a connection's thread."""
         if self._recording is not None and not hasattr(self._priorities, "is_low"):
             self._priorities.is_low = True
-            os.nice(_LOW_PRIORITY)
+            step_back(_LOW_PRIORITY)
 
     def _own(self, client: str) -> None:
         """Gives the camera to a page, unless another one has it."""

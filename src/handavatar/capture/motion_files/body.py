@@ -41,11 +41,11 @@ def read_amass(part: Part, conventions: Conventions) -> HandTrack:
     if values.shape[-1] != _VALUES:
         raise CaptureError(
             f"{part.path}: poses has shape {values.shape}, expected (frames, {_VALUES})",
-            "take AMASS's SMPL+H files; a hand's own parameters are --layout mano",
+            "take AMASS's SMPL+H files; a hand's own parameters are `layout='mano'`",
         )
     if conventions.side == "auto":
         raise CaptureError(
-            f"{part.path}: it holds both hands", "name one: --side left or --side right"
+            f"{part.path}: it holds both hands", "name one: `side='left'` or `side='right'`"
         )
     poses = rows_of(values, (_VALUES,), "poses", part.path)
     fingers = torch.from_numpy(poses[:, _HANDS[conventions.side]].copy())

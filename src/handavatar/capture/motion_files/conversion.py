@@ -18,13 +18,14 @@ from handavatar.capture.motion_files.plausibility import (
 )
 from handavatar.capture.motion_files.soma import soma_frames
 from handavatar.capture.motion_files.track import UNITS, Conventions, HandTrack
+from handavatar.errors import argument
 from handavatar.hand.mano import ManoModel, Side
 from handavatar.hand.retargeting import rest_frames, retarget
 from handavatar.hand.rig import LicensedRigMissing, Rig
 from handavatar.hand.rigs import load_mano
 
 Tell = Callable[[str], None]
-_HINT = "name your own with --mano MANO_RIGHT.pkl (MANO_LEFT.pkl), see docs/mano.md"
+_HINT = "name your own with `mano` MANO_RIGHT.pkl (MANO_LEFT.pkl), see docs/mano.md"
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,8 @@ class ManoFinder:
         model = self._load(side, purpose)
         if model.side != side:
             raise CaptureError(
-                f"--mano {self.reference}: it is of the {model.side} hand, the motion of the "
-                f"{side} one",
+                f"{argument('mano', self.reference)}: it is of the {model.side} hand, the motion "
+                f"of the {side} one",
                 f"name MANO_{side.upper()}.pkl",
             )
         return model
@@ -108,7 +109,7 @@ def motion_of_file(
     finder = ManoFinder(mano)
     track, layout = read_track(source, conventions, finder.of_side)
     if conventions.layout == "auto":
-        tell(f"taken for {layout.writer}: --layout {layout.name}")
+        tell(f"taken for {layout.writer}: `layout={layout.name!r}`")
     for note in track.notes:
         tell(note)
     if track.side == "left":
@@ -117,7 +118,7 @@ def motion_of_file(
     rate = track.fps or fps
     if rate is None:
         raise CaptureError(
-            f"{source}: it does not say how many frames a second it has", "say it with --fps"
+            f"{source}: it does not say how many frames a second it has", "say it with `fps`"
         )
     times = track.frames.double() / rate
     try:

@@ -80,8 +80,8 @@ def read_track(
         name = "hawor" if is_folder_of_hawor else detect_layout(parts, conventions, source)
     elif is_folder_of_hawor and name != "hawor":
         raise CaptureError(
-            f"{source}: it holds the folders 0 and 1 of HaWoR, --layout says {name}",
-            "leave --layout out, or name a file",
+            f"{source}: it holds the folders 0 and 1 of HaWoR, `layout` says {name}",
+            "leave `layout` out, or name a file",
         )
     layout = LAYOUTS[name]
     conventions = _with_mean(conventions, layout, source)
@@ -113,13 +113,13 @@ def _with_mean(conventions: Conventions, layout: Layout, source: Path) -> Conven
         counts_from = "the flat hand" if known == "true" else "MANO's mean pose"
         raise CaptureError(
             f"{source}: poses of {layout.writer} count from {counts_from}, "
-            f"--flat-hand-mean says {conventions.flat_hand_mean}",
-            "leave --flat-hand-mean out, or say --layout mano for a file of your own",
+            f"`flat_hand_mean` says {conventions.flat_hand_mean}",
+            "leave `flat_hand_mean` out, or say `layout='mano'` for a file of your own",
         )
     if conventions.use_pca and known == "true":
         raise CaptureError(
-            f"{source}: {layout.writer} hold no principal components, --use-pca says so",
-            "leave --use-pca out, or say --layout mano for a file of your own",
+            f"{source}: {layout.writer} hold no principal components, `use_pca` says so",
+            "leave `use_pca` out, or say `layout='mano'` for a file of your own",
         )
     return replace(conventions, flat_hand_mean=known)
 
@@ -154,12 +154,12 @@ def detect_layout(parts: list[Part], conventions: Conventions, source: Path) -> 
         return "mano"
     if {"schema", "rotations", "translations"} <= set(fields):
         raise CaptureError(
-            f"{source}: it is a motion file already", "give it to handavatar render RUN --motion"
+            f"{source}: it is a motion file already", "give it to handavatar render RUN as `motion`"
         )
     held = ", ".join(name for name in sorted(fields)[:12] if name) or "one array without a name"
     raise CaptureError(
         f"{source}: its layout is not known; it holds {held}",
-        f"say what wrote it with --layout: {', '.join(LAYOUTS)}",
+        f"say what wrote it with `layout`: {', '.join(LAYOUTS)}",
     )
 
 
@@ -181,7 +181,7 @@ def _tracker(parts: list[Part], conventions: Conventions, source: Path) -> Layou
             raise CaptureError(
                 f"{source}: a left hand of a tracker (or one of an unknown side), which HaMeR and "
                 "WiLoR describe as a mirrored right hand, WiLoR-mini as a left one",
-                "say which: --layout hamer, wilor or wilor-mini",
+                "say which: `layout='hamer'`, wilor or wilor-mini",
             )
     return "hamer" if _has_matrices(parts[0].fields) else "wilor-mini"
 

@@ -222,7 +222,7 @@ def _flat_rows(fields: Fields, names: tuple[str, ...], path: Path) -> np.ndarray
     if values.shape[-3:] == (15, 3, 3):
         raise CaptureError(
             f"{path}: {name} holds matrices, whose mean pose cannot be told",
-            "name the tracker that wrote them with --layout, or save axis-angle vectors",
+            "name the tracker that wrote them with `layout`, or save axis-angle vectors",
         )
     if values.ndim >= 2 and values.shape[-2:] in ((15, 3), (16, 3)):
         values = values.reshape(*values.shape[:-2], -1)
@@ -301,7 +301,7 @@ def _absolute_vectors(
     if conventions.flat_hand_mean == "auto":
         raise CaptureError(
             f"{source}: it does not say what its finger poses count from",
-            "say --flat-hand-mean true (the flat hand: HO-3D, trackers) or false (MANO's mean "
+            "say `flat_hand_mean='true'` (the flat hand: HO-3D, trackers) or false (MANO's mean "
             "pose: InterHand2.6M, FreiHAND, DexYCB, ARCTIC raw)",
         )
     notes: list[str] = []

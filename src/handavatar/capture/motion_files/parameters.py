@@ -205,7 +205,7 @@ def told_sides(conventions: Conventions, count: int, path: Path) -> Tensor:
     """
     if conventions.side == "auto":
         raise CaptureError(
-            f"{path}: it does not say which hand it is", "say --side left or --side right"
+            f"{path}: it does not say which hand it is", "say `side='left'` or `side='right'`"
         )
     return torch.full((count,), int(conventions.side == "right"))
 
@@ -293,14 +293,14 @@ def choose_side(has_left: bool, has_right: bool, conventions: Conventions, path:
     if has_left and has_right:
         if told == "auto":
             raise CaptureError(
-                f"{path}: it holds both hands", "name one: --side left or --side right"
+                f"{path}: it holds both hands", "name one: `side='left'` or `side='right'`"
             )
         return told
     held: Side = "right" if has_right else "left"
     if told not in ("auto", held):
         raise CaptureError(
-            f"{path}: it holds a {held} hand, --side says {told}",
-            f"leave --side out, or name the file of the {told} hand",
+            f"{path}: it holds a {held} hand, `side` says {told}",
+            f"leave `side` out, or name the file of the {told} hand",
         )
     return held
 

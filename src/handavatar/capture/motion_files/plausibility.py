@@ -18,6 +18,7 @@ from handavatar.capture.motion_files.track import (
     HandTrack,
     mirrored_rotations,
 )
+from handavatar.errors import argument
 from handavatar.geometry.rotations import axis_angle_from_matrix
 from handavatar.hand.mano import ManoModel
 from handavatar.hand.pose import BONE_NAMES, FINGER_BONES
@@ -54,9 +55,9 @@ def check_distance(wrists: Float[Tensor, "steps 3"], conventions: Conventions, l
     """
     depth = float(wrists[:, 2].median())
     if depth < 0:
-        remedy = "its axes may be OpenGL's (y up, z backwards): say --axes opengl"
+        remedy = "its axes may be OpenGL's (y up, z backwards): say `axes='opengl'`"
         if conventions.axes == "opengl":
-            remedy = "leave --axes out: with OpenCV's axes it is in front of it"
+            remedy = "leave `axes` out: with OpenCV's axes it is in front of it"
         raise CaptureError(f"the hand is {-depth:.3g} m behind the camera", remedy)
     if NEAREST <= depth <= FARTHEST:
         return
@@ -71,7 +72,7 @@ def _unit_remedy(depth: float, conventions: Conventions, layout: str) -> str:
     if layout in _TRACKERS and depth > FARTHEST:
         return (
             "depths of HaMeR and WiLoR are for a focal length of 5000 / 256 times the picture's "
-            "longer side: say the true one in pixels with --focal"
+            "longer side: say the true one in pixels with `focal`"
         )
     fitting = [
         name
@@ -79,7 +80,7 @@ def _unit_remedy(depth: float, conventions: Conventions, layout: str) -> str:
         if name != conventions.unit and NEAREST <= stored * metres <= FARTHEST
     ]
     if fitting:
-        return f"its unit may be another: --unit {' or --unit '.join(fitting)}"
+        return f"its unit may be another: {' or '.join(argument('unit', unit) for unit in fitting)}"
     return "give translations in the camera's frame"
 
 
@@ -95,7 +96,7 @@ def check_reach(wrists: Float[Tensor, "steps 3"], conventions: Conventions) -> N
         fitting = [n for n, metres in UNITS.items() if stored * metres <= WORLD_REACH]
         raise CaptureError(
             f"the hand is {reach:.4g} m from the origin, expected {WORLD_REACH:g} m at most",
-            f"its unit may be another: --unit {' or --unit '.join(fitting)}"
+            f"its unit may be another: {' or '.join(argument('unit', unit) for unit in fitting)}"
             if fitting
             else "give translations in metres",
         )
@@ -164,7 +165,7 @@ def check_bends(
         "mean pose or the order of the bones is another",
         "within the limits it is, if " + "; or if ".join(fitting)
         if fitting
-        else "check --side, --flat-hand-mean, --use-pca and --layout against what wrote the file",
+        else "check `side`, `flat_hand_mean`, `use_pca` and `layout` against what wrote the file",
     )
 
 
@@ -184,11 +185,11 @@ def _other_conventions(
     elif model is not None:
         tries += [
             (
-                "its poses count from MANO's mean pose: --layout mano --flat-hand-mean false",
+                "its poses count from MANO's mean pose: `layout='mano'` `flat_hand_mean='false'`",
                 with_mean(rotations, model),
             ),
             (
-                "its poses hold MANO's mean pose already: --layout mano --flat-hand-mean true",
+                "its poses hold MANO's mean pose already: `layout='mano'` `flat_hand_mean='true'`",
                 without_mean(rotations, model),
             ),
         ]
@@ -198,7 +199,7 @@ def _other_conventions(
 def _side_remedy(layout: str, other: str) -> str:
     if layout in _TRACKERS:
         return (
-            f"it is a {other} hand, or a left one as another tracker describes it: --layout hamer, "
-            "wilor or wilor-mini"
+            f"it is a {other} hand, or a left one as another tracker describes it: "
+            "`layout='hamer'`, wilor or wilor-mini"
         )
-    return f"it is a {other} hand: --side {other}"
+    return f"it is a {other} hand: `side={other!r}`"

@@ -164,8 +164,8 @@ def read_soma(part: Part, conventions: Conventions) -> HandTrack:
         places = torch.from_numpy(array_field(fields, ("transl",), path)).reshape(-1, 3)
         if conventions.unit != "m" and UNITS[conventions.unit] != _unit(part):
             raise CaptureError(
-                f"{path}: its unit is {text_value(fields['unit'])}, --unit says {conventions.unit}",
-                "leave --unit out",
+                f"{path}: its unit is {text_value(fields['unit'])}, `unit` says {conventions.unit}",
+                "leave `unit` out",
             )
         places = places * (_unit(part) / UNITS[conventions.unit])
         if len(places) != len(rotations):

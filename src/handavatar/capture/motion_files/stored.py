@@ -242,7 +242,7 @@ def array_field(fields: Fields, names: tuple[str, ...], path: Path) -> np.ndarra
         have = ", ".join(sorted(fields)[:12]) or "nothing"
         raise CaptureError(
             f"{path}: there is no {' or '.join(names)}; it holds {have}",
-            f"save {names[0]}, or say with --layout what wrote the file",
+            f"save {names[0]}, or say with `layout` what wrote the file",
         )
     value = fields[name]
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":

@@ -143,7 +143,7 @@ def _stored_focal(part: Part, count: int) -> Float[Tensor, "rows"]:
         return _DEFAULT_FOCAL / _CROP * picture.amax(-1)
     raise CaptureError(
         f"{path}: it does not say which focal length its depths belong to",
-        "save scaled_focal_length or img_size as well, or leave out --focal",
+        "save scaled_focal_length or img_size as well, or leave out `focal`",
     )
 
 
@@ -166,13 +166,13 @@ def hawor_chunks(source: Path, conventions: Conventions) -> list[Path]:
         held = {side: sorted(folder.glob("*.json")) for side, folder in hands.items()}
         if held["left"] and held["right"] and conventions.side == "auto":
             raise CaptureError(
-                f"{source}: it holds both hands", "name one: --side left or --side right"
+                f"{source}: it holds both hands", "name one: `side='left'` or `side='right'`"
             )
         side = conventions.side
         if side == "auto":
             side = "left" if held["left"] else "right"
         if not held[side]:
-            raise CaptureError(f"{source}: it holds no {side} hand", "name the other with --side")
+            raise CaptureError(f"{source}: it holds no {side} hand", "name the other with `side`")
         return held[side]
     return sorted(source.glob("*.json"))
 

@@ -55,16 +55,15 @@ function showProgress() {
   const speed = `${about.steps_per_second.toFixed(about.steps_per_second < 10 ? 1 : 0)} steps/s`;
   const figures = Object.entries(about.figures).map(([name, value]) => `${name} ${value}`);
   const where = about.job ? `${about.job}: step ${about.step} of ${about.total}` : "training begins";
-  const parts = about.phase === "stopped" ? [where, "training has stopped; the same command with --resume auto continues it"]
+  const parts = about.phase === "stopped" ? [where, "training has stopped; the same command goes on from there"]
     : !about.job ? [where]
-      : about.step >= about.total ? [`${about.job}: done; what comes next is being prepared`]
-        : [where, speed, duration(about.seconds_left), ...figures];
+      : [`${Math.round(100 * about.share)} %`, where, speed, duration(about.seconds_left), ...figures];
   $("job").textContent = parts.join("   ");
   $("job").dataset.phase = about.phase;
   $("job").dataset.job = about.job;
   $("job").dataset.step = about.step;
-  $("bar").max = Math.max(about.total, 1);
-  $("bar").value = about.step;
+  $("bar").max = 1;
+  $("bar").value = about.share;
   document.title = about.job ? `${about.job} ${about.step}/${about.total}` : "HandAvatar: training";
 }
 
