@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from mano_files import write_mano
 from torch import Tensor
 
@@ -14,11 +14,14 @@ from handavatar.capture.fitted_hand import HandFit, HandModel, projected
 from handavatar.capture.fitting import (
     FitOptions,
     Observations,
+    OutlinePairs,
     fit_hands,
+    frame_energy,
     initial_fit,
     landmark_errors,
     placed,
     refined,
+    retried,
 )
 from handavatar.capture.outlines import (
     OutlineMatcher,
@@ -31,8 +34,14 @@ from handavatar.capture.windows import Window, window_camera
 from handavatar.geometry.rotations import axis_angle_from_matrix, matrix_from_axis_angle
 from handavatar.hand.mano import read_mano
 from handavatar.hand.open_hand import load_open_hand
-from handavatar.hand.pose import NUM_BONES, HandPose
-from handavatar.hand.pose_sampling import gesture_rotations, interpolate_rotations
+from handavatar.hand.pose import FINGER_BONES, NUM_BONES, HandPose
+from handavatar.hand.pose_sampling import (
+    angles_from_rotations,
+    gesture_rotations,
+    interpolate_rotations,
+    limit_excess,
+    rotations_from_angles,
+)
 from handavatar.hand.rig import Rig
 
 PICTURE = (1280, 720)
@@ -193,6 +202,89 @@ def test_known_poses_come_back_from_their_landmarks(rig: Rig, truth: HandFit) ->
     assert (found / size - true).norm(dim=-1).median() < 0.005
     ratio = fit.focal / fit.translation[:, 2] * truth.translation[:, 2] / truth.focal
     assert torch.allclose(size * ratio, torch.ones(FRAMES), atol=0.05)
+
+
+def test_joints_are_not_bent_beyond_what_hands_can(rig: Rig, truth: HandFit) -> None:
+    """Landmarks that show an index finger bent backwards by 50 degrees do not make it so."""
+    rotations = truth.rotations.clone()
+    middle = FINGER_BONES["index"][1]
+    angles = angles_from_rotations(rig, rotations)
+    angles[:, middle] = torch.tensor([-50.0, 0, 0]).deg2rad()
+    rotations[:, middle] = rotations_from_angles(rig, angles)[:, middle]
+    impossible = replace(truth, rotations=rotations)
+    assert float(limit_excess(rig, rotations)[:, middle].min()) > math.radians(49)
+    model, seen = HandModel(rig), _seen(rig, impossible)
+    fit = refined(model, seen, truth, FitOptions(), steps=40)
+    # A tenth of it: the limits give way by some degrees. Without them it is bent by 38.
+    assert float(limit_excess(rig, fit.rotations)[:, 1:].max()) < math.radians(5)
+
+
+def test_noise_of_single_frames_does_not_make_the_hand_tremble(rig: Rig, truth: HandFit) -> None:
+    model, seen = HandModel(rig), _seen(rig, truth)
+    noise = 6 * torch.randn(FRAMES, 21, 2, generator=torch.manual_seed(2))
+    shaken = replace(seen, landmarks=seen.landmarks + noise)
+
+    def trembling(options: FitOptions) -> float:
+        fit = refined(model, shaken, truth, options, steps=40)
+        points = model.landmarks(fit) - model.landmarks(truth)
+        return float(points.diff(n=2, dim=0).norm(dim=-1).mean())
+
+    # However fast they change their speed, frames say nothing of each other.
+    assert trembling(FitOptions()) < 0.6 * trembling(FitOptions(acceleration=1e6))
+
+
+def test_one_wrong_landmark_moves_nothing_else(rig: Rig, truth: HandFit) -> None:
+    model, seen = HandModel(rig), _seen(rig, truth)
+    wrong, tip = seen.landmarks.clone(), LANDMARK_NAMES.index("index_tip")
+    wrong[2, tip] += torch.tensor([120.0, -60.0])
+    fit = refined(model, replace(seen, landmarks=wrong), truth, FitOptions(), steps=40)
+    places = projected(model.landmarks(fit), fit.log_focal.exp(), CENTER)
+    beside = (places - seen.landmarks).norm(dim=-1)
+    # A tenth of the 134 pixels that it was moved by; of the others half of the 7 that a landmark is
+    # taken to be off at this depth.
+    assert float(beside[2, tip]) < 13.4
+    beside[2, tip] = 0.0
+    assert float(beside.max()) < 3.5
+
+
+class _NoPairs:
+    """Sees no outline in any frame: landmarks alone tell how well a frame is explained."""
+
+    def __init__(self, frames: int) -> None:
+        self.frames = frames
+
+    def __call__(self, vertices: Float[Tensor, "frames vertices 3"], focal: float) -> OutlinePairs:
+        return OutlinePairs(
+            torch.zeros(self.frames, 1, dtype=torch.long),
+            torch.zeros(self.frames, 1, 2),
+            torch.zeros(self.frames, 1, 2),
+            torch.zeros(self.frames, 1),
+        )
+
+    def chosen(self, frames: Int[Tensor, "chosen"]) -> "_NoPairs":
+        return _NoPairs(len(frames))
+
+
+def test_a_frame_that_fits_badly_is_begun_again_from_its_neighbours(
+    rig: Rig, truth: HandFit
+) -> None:
+    """A fist in one frame of an open hand; one step is all that an attempt has."""
+    model, seen, bad = HandModel(rig), _seen(rig, truth), 1
+    rotations = truth.rotations.clone()
+    rotations[bad, 1:] = gesture_rotations(rig, "fist")[1:]
+    spoilt = replace(truth, rotations=rotations)
+    options, pairs = FitOptions(retry_steps=1), _NoPairs(FRAMES)
+    fit = retried(model, seen, spoilt, options, pairs)
+    before, after = (
+        frame_energy(model, seen, tried, options, pairs)[bad] for tried in (spoilt, fit)
+    )
+    assert float(after) < 0.5 * float(before)
+    # Of a neighbour's fingers, but for the step; the nearest gesture is half as far again.
+    apart = (fit.rotations[bad, 1:] - truth.rotations[[bad - 1, bad + 1], 1:]).abs().amax((-1, -2))
+    assert float(apart.min()) < 0.03
+    others = [frame for frame in range(FRAMES) if frame != bad]
+    assert torch.equal(fit.rotations[others], spoilt.rotations[others])
+    assert torch.equal(fit.translation[others], spoilt.translation[others])
 
 
 def test_outlines_draw_the_mesh_onto_the_mask(rig: Rig, truth: HandFit) -> None:

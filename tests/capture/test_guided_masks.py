@@ -12,6 +12,7 @@ from handavatar.capture.guided_masks import (
     GuidedMask,
     PlacedMesh,
     WristLine,
+    at_average_exposure,
     cut_at_wrist,
     find_guided_mask,
     is_cut_unsure,
@@ -134,6 +135,32 @@ def test_exposure_is_taken_back_before_colours_are_judged() -> None:
     found = find_guided_mask(hands[-1], meshes[-1], colors, gain)
     before = _before(meshes[-1])
     assert _overlap(found.mask.pixels & before, made[-1][1] & before) > 0.97
+
+
+def test_the_average_exposure_is_that_of_a_gain_of_one() -> None:
+    image = np.random.default_rng(0).integers(20, 200, (8, 8, 3), dtype=np.uint8)
+    gain = np.array([0.8, 1.0, 1.25])
+    exposed = (image * gain).round().astype(np.uint8)
+    # Rounded twice, the first time in units of up to 1 / 0.8.
+    assert np.abs(at_average_exposure(exposed, gain).astype(float) - image).max() <= 1
+    assert (at_average_exposure(image, np.ones(3)) == image).all()
+
+
+def test_a_wall_that_is_hardly_darker_than_the_skin_does_not_join_the_hand() -> None:
+    """By seven per cent, all over the picture: colours lean to the hand, the mesh has a word."""
+    shade = (0.7 + 0.3 * np.mgrid[:SIDE, :SIDE][1] / SIDE)[..., None]
+    hands, truths = [], []
+    for number in NUMBERS:
+        hand, truth = made_hand(number)
+        noise = np.random.default_rng(number).normal(0, 5, (SIDE, SIDE, 3))
+        wall = 0.93 * SKIN * shade + noise
+        hands.append(_with_image(hand, np.where(truth[..., None], hand.window.image, wall)))
+        truths.append(truth)
+    found, mesh = _found(hands)
+    before = _before(mesh)
+    border = (truths[-1] & ~ndimage.binary_erosion(truths[-1]) & before).sum()
+    # Half a pixel along the border; colours alone would have most of a pixel.
+    assert (found.mask.pixels & ~truths[-1] & before).sum() < 0.5 * border
 
 
 def test_the_wrist_is_cut_along_a_straight_line_to_a_fraction_of_a_pixel() -> None:

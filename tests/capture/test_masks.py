@@ -109,6 +109,17 @@ def test_scale_is_focal_length_over_depth() -> None:
     assert pixels_per_metre(hand) == pytest.approx(800, rel=0.05)
 
 
+def test_scale_does_not_depend_on_where_fingers_point() -> None:
+    """Of a hand that is turned away by 70 degrees, before a camera without perspective."""
+    hand, _ = made_hand(0)
+    turn = np.radians(70)
+    turned = hand.world_landmarks @ np.array(
+        [[1, 0, 0], [0, np.cos(turn), np.sin(turn)], [0, -np.sin(turn), np.cos(turn)]]
+    )
+    seen = replace(hand, world_landmarks=turned, landmarks=800 * turned[:, :2] + 200)
+    assert pixels_per_metre(seen) == pytest.approx(800)
+
+
 @pytest.mark.parametrize(("wall", "least"), [(None, 0.985), ((120, 122, 127), 0.970)])
 def test_the_lit_sides_of_fingers_belong_to_them(
     wall: tuple[int, int, int] | None, least: float

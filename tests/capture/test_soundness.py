@@ -98,6 +98,18 @@ def test_worse_captures_are_no_bad_ones(worse: dict, seed: int, tmp_path: Path) 
     assert find_problems(tmp_path / "worse") == []
 
 
+@pytest.mark.parametrize(("pixels", "side"), [(9, "left"), (-10, "right")])
+def test_it_is_told_to_which_side_all_masks_lie(pixels: int, side: str, tmp_path: Path) -> None:
+    """The principal point moves the hand that is drawn, not the masks."""
+    scene = copied(default_capture().folder, tmp_path, 8)
+    for entry in scene.frames:
+        entry["cx"] += pixels
+    (tmp_path / "transforms.json").write_text(json.dumps(scene.content))
+    (problem,) = find_problems(tmp_path)
+    # Some of it is taken off for what chance may do.
+    assert re.search(rf"the masks lie ([89]|10) pixels {side}\b", problem.what)
+
+
 def test_captures_of_the_tests_are_sound(tmp_path: Path) -> None:
     for number, facts in enumerate(
         (

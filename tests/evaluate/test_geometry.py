@@ -133,6 +133,33 @@ def test_contact_errors_are_those_of_the_field(fist: Truth) -> None:
     assert full.whole + empty.whole == pytest.approx(1) and 0.02 < full.whole < 0.98
 
 
+def test_contacts_are_judged_in_balls_about_them(fist: Truth) -> None:
+    """Evenly: an eighth of the points lies within half of the reach."""
+    truth = Truth(fist.hand, fist.skin)
+    truth.__dict__["contacts"] = fist.contacts[:1]
+    asked = []
+
+    def field(points: torch.Tensor) -> torch.Tensor:
+        asked.append((points - fist.contacts[0]).norm(dim=-1))
+        return torch.zeros(len(points))
+
+    contact_errors(field, truth, _random(), 4000)
+    distances = torch.cat(asked)
+    assert float(distances.max()) <= CONTACT_REACH
+    # Three standard deviations of a share of 1/8 among 4000.
+    half = float((distances < CONTACT_REACH / 2).float().mean())
+    assert half == pytest.approx(1 / 8, abs=0.016)
+
+
+def test_skin_that_is_buried_in_folds_is_missed_by_nobody(fist: Truth) -> None:
+    """Of a fist without the faces that nobody can see from outside nothing is missing."""
+    is_outside = fist.is_outmost[fist.faces].any(-1)
+    assert 10 < int((~is_outside).sum()) < 200
+    found = chamfer(fist.vertices, fist.faces[is_outside], fist)
+    # In float32: vertices of a mesh lie on its own faces.
+    assert found.from_truth < 1e-7
+
+
 def _random() -> torch.Generator:
     return torch.Generator().manual_seed(0)
 

@@ -202,6 +202,7 @@ def test_unknown_pixels_count_in_no_figure() -> None:
     assert masked_scores([clean]) == masked_scores([spoilt])
     assert zone_scores([clean]) == zone_scores([spoilt])
     assert mean_mask_iou([clean]) == mean_mask_iou([spoilt])
+    assert not bool((clean.region() & ~known).any())
     # Nor does it matter what the avatar does there.
     elsewhere = replace(clean, rendered=torch.where(known[..., None], clean.rendered, 1.0))
     assert masked_scores([elsewhere]) == masked_scores([clean])

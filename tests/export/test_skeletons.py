@@ -57,6 +57,16 @@ def test_webxr_joints_look_at_the_next_one_with_the_back_of_the_hand_up(rig: Rig
             assert float(up @ nail / nail.norm()) > 0.75, (word, part)
 
 
+def test_metacarpals_of_webxr_lie_near_the_wrist(rig: Rig) -> None:
+    """Three tenths of the way to the knuckle; the thumb's is its first joint."""
+    skeleton = skeleton_of(rig.shaped(), "webxr")
+    places = skeleton.file_from_joint[:, :3, 3]
+    for finger in ("index", "middle", "ring", "pinky"):
+        joint = XR_JOINTS.index(f"{finger}-finger-metacarpal")
+        expected = 0.7 * places[0] + 0.3 * places[joint + 1]
+        torch.testing.assert_close(places[joint], expected)
+
+
 def test_every_bone_is_carried_once_by_a_joint_at_its_place(rig: Rig) -> None:
     hand = rig.shaped()
     for names in ("webxr", "mano", "vrm", "unity"):

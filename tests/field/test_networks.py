@@ -70,3 +70,17 @@ def test_depth_counts_hidden_layers() -> None:
     assert len(network.hidden) == 4 and network(torch.zeros(3, 5)).shape == (3, 2)
     widths = [(layer.in_features, layer.out_features) for layer in SkipMLP(64, 128, 1).layers]
     assert widths == [(64, 128), (128, 64), (128, 128), (128, 128)]
+
+
+def test_the_joined_network_agrees_with_its_formula() -> None:
+    """The input joins the second hidden layer's units, with as much variance as they have."""
+    torch.manual_seed(0)
+    network, inputs = SkipMLP(8, 20, 2), torch.randn(5, 8)
+    (w1, b1), (w2, b2), (w3, b3), (w4, b4) = (
+        (layer.weight, layer.bias) for layer in network.layers
+    )
+    second = (w2 @ (w1 @ inputs.T + b1[:, None]).relu() + b2[:, None]).relu()
+    joined = torch.cat([second, inputs.T]) * 0.5**0.5
+    last = (w4 @ (w3 @ joined + b3[:, None]).relu() + b4[:, None]).relu()
+    expected = (network.output.weight @ last + network.output.bias[:, None]).T
+    torch.testing.assert_close(network(inputs), expected)

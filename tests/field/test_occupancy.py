@@ -197,6 +197,28 @@ def test_nothing_lies_outside_every_box(rig: Rig, parts: Parts) -> None:
     assert result.whole.shape == (700,) and float(result.whole.max()) <= 1
 
 
+def test_nothing_lies_behind_the_wrist(rig: Rig, parts: Parts) -> None:
+    """Three millimetres behind the farthest point of the hand's end, in the box of the wrist."""
+    field, posed = _field(), any_pose(rig, turn=0.7)
+    codes = field.encode(parts, posed)
+    rim = posed.vertices[rig.rim]
+    inwards = torch.nn.functional.normalize(posed.vertices.mean(0) - rim.mean(0), dim=0)
+    # The wrist's own axis, across the ring: its least spread.
+    across = torch.linalg.svd(rim - rim.mean(0)).Vh[2]
+    across = across if float(across @ inwards) > 0 else -across
+    before = ((rim - rim.mean(0)) @ across).amin()
+    middle = rim.mean(0) + before * across
+    steps = torch.tensor([0.003, -0.003])
+    points = middle + steps[:, None] * across
+    local = local_points(codes.boxes, points)[:, 0]
+    margin = codes.boxes.margin
+    lower, upper = codes.boxes.lower[0] - margin, codes.boxes.upper[0] + margin
+    assert bool(((local > lower) & (local < upper)).all())
+    result, (whole, soft) = field(codes, points), field.plain(codes, points)
+    for found in (result.whole, whole, result.soft_parts[:, 0], soft[:, 0]):
+        assert found.detach()[0] > 0 and found.detach()[1] == 0
+
+
 def test_no_points_give_no_values(rig: Rig, parts: Parts) -> None:
     field = _field()
     result = field(field.encode(parts, any_pose(rig)), torch.zeros(0, 3))

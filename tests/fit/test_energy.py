@@ -1,5 +1,6 @@
 """What observations say of a pose: the energy's slope, and what it must not depend on."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -94,8 +95,11 @@ def _close(gradient: torch.Tensor, slope: torch.Tensor) -> tuple[float, float]:
 SEEN_WELL = [0, 1, 2, 3, 5, 12, 14, 15, 21, 24, 30, 33, 39, 40, 41, 48, 49, 50]
 
 
-@pytest.mark.parametrize("skin", [(), (30, 500, 700)])
-def test_the_slope_of_landmarks_is_exact(rig: Rig, skin: tuple[int, ...]) -> None:
+@pytest.mark.parametrize(
+    ("skin", "outlier"), [((), FAR), ((30, 500, 700), FAR), ((30, 500, 700), 1.0)]
+)
+def test_the_slope_of_landmarks_is_exact(rig: Rig, skin: tuple[int, ...], outlier: float) -> None:
+    """Also of landmarks that are so far off that they lose their pull."""
     camera = camera_over(SIZE)
     vertices = torch.tensor(skin, dtype=torch.long)
     points = points_on(rig.shaped(), ShapeSpace.around(rig, 0.5, 2), 20)
@@ -109,7 +113,7 @@ def test_the_slope_of_landmarks_is_exact(rig: Rig, skin: tuple[int, ...]) -> Non
         torch.ones(3),
     )
     seen = Observation(blank, 0.0, sightings(points.hand, pose, camera, vertices=vertices))
-    options = replace(SQUARES, outline_points=0.0)
+    options = replace(SQUARES, outline_points=0.0, landmark_outlier=outlier)
     found = _linearised(points, pose, seen, options)
     assert found.gradient.shape == (NUM_UNKNOWNS + 12 + 63,)
     slopes = _slopes(points, pose, seen, options, SEEN_WELL, 1e-3)
@@ -131,6 +135,37 @@ def test_the_slope_of_landmarks_is_exact(rig: Rig, skin: tuple[int, ...]) -> Non
         slope = (ends[0] - ends[1]) / (2 * abs(float(shared[unknown])))
         gradient = 2 * float(found.gradient[NUM_UNKNOWNS + unknown])
         assert gradient == pytest.approx(slope, rel=0.02, abs=1.0)
+
+
+def test_relative_depths_say_nothing_of_how_far_the_hand_is(rig: Rig) -> None:
+    """Where landmarks are in the picture is told to be unknown: their depths are all there is."""
+    camera = camera_over(SIZE)
+    points = with_landmarks(points_on(rig.shaped(), count=20))
+    pose = pose_at(calm_poses(rig, 1), 0)
+    seen = observed(points.hand, pose, camera)
+    told = sightings(points.hand, pose, camera)
+    told = replace(told, errors=torch.full_like(told.errors, 1e6))
+    options = replace(SQUARES, outline_points=0.0, contact_error=math.inf)
+    found = _linearised(points, pose, replace(seen, landmarks=told), options)
+    sight = camera.camera_from_world[2, :3]
+    shift = found.hessian[48:51, 48:51]
+    # In float32 of squares of 1 / 0.02 m.
+    assert float(sight @ shift @ sight) < 1e-3 * 21 / 0.02**2
+    assert float(found.hessian[:3, :3].diagonal().max()) > 1.0
+
+
+def test_outlines_find_their_own_side_of_a_finger(rig: Rig) -> None:
+    """A hand that lies half a finger aside is drawn back by as much, not to the finger beside."""
+    camera = camera_over(SIZE)
+    pose = pose_at(calm_poses(rig, 1), 0)
+    seen = observed(rig.shaped(), pose, camera)
+    points = points_on(rig.shaped(), count=20)
+    right = camera.camera_from_world[0, :3]
+    aside = HandPose(pose.rotations, pose.translation + 0.008 * right)
+    found = _linearised(points, aside, seen, EnergyOptions(), outlier=30.0)
+    slope, curvature = found.gradient[48:51] @ right, right @ found.hessian[48:51, 48:51] @ right
+    # To a tenth: without regard to the sides it is 6.6 mm.
+    assert float(slope / curvature) == pytest.approx(0.008, rel=0.1)
 
 
 def test_the_slope_of_outlines(rig: Rig) -> None:

@@ -15,7 +15,8 @@ from made_frames import (
 
 from handavatar.fit import solver
 from handavatar.fit.energy import EnergyOptions, HandPoints, Observation
-from handavatar.fit.kinematics import NUM_UNKNOWNS
+from handavatar.fit.kinematics import NUM_UNKNOWNS, moved_pose, pose_difference
+from handavatar.fit.pictures import FramePicture
 from handavatar.fit.shape import ShapeSpace, fixed_shape
 from handavatar.fit.solver import Descent, Look
 from handavatar.hand.pose import HandPose
@@ -167,6 +168,41 @@ def test_a_true_shape_stays(rig: Rig, truth: HandPose, frames: list[Observation]
     assert 1000 * float((hand.rest_vertices - rig.template_vertices).norm(dim=-1).mean()) < 1.0
     apart = hand.posed(descent.poses).vertices - rig.shaped().posed(truth).vertices
     assert 1000 * float(apart.norm(dim=-1).mean()) < 1.6
+
+
+@pytest.fixture(scope="module")
+def blank(frames: list[Observation]) -> list[Observation]:
+    """The frames, of which nothing is known."""
+    nothing = torch.zeros(SIZE, SIZE)
+    picture = FramePicture.of(
+        camera_over(SIZE), torch.zeros(SIZE, SIZE, 3), nothing, nothing > 0, torch.ones(3)
+    )
+    return [replace(seen, picture=picture) for seen in frames]
+
+
+def test_where_nothing_is_seen_the_shape_is_the_usual_one(
+    rig: Rig, truth: HandPose, blank: list[Observation]
+) -> None:
+    space = ShapeSpace.around(rig, 1.0, 2)
+    descent = _descent(rig.shaped(), blank, truth, 5.0, space)
+    descent.shared = 0.5 * space.sigmas
+    descent.step_shape(Look(0.7, 3.0), 4)
+    # Each step leaves a hundredth and less: its damping.
+    assert bool((descent.shared.abs() < 0.01 * space.sigmas).all())
+
+
+def test_no_step_turns_a_joint_by_more_than_twenty_degrees(
+    rig: Rig, truth: HandPose, blank: list[Observation]
+) -> None:
+    """However far the pose is from where it was tracked."""
+    descent = _descent(rig.shaped(), blank, truth, 1.0)
+    away = torch.zeros(FRAMES, NUM_UNKNOWNS)
+    away[:, 0] = 1.2
+    descent.poses = moved_pose(truth, away)
+    begin = descent.poses
+    descent.step_poses(Look(0.7, 3.0), 1)
+    turned = pose_difference(begin, descent.poses)[:, :-3].abs().amax(-1)
+    assert bool((turned > 0.34).all()) and bool((turned < 0.351).all())
 
 
 def test_of_very_many_frames_some_bands_are_made_again_and_nothing_changes(

@@ -122,6 +122,21 @@ def test_nearest_rotations_mean_the_same_and_lie_nearer() -> None:
     torch.testing.assert_close(nearest_rotations(turned, torch.zeros(3)), expected)
 
 
+def test_the_mean_of_turns_far_apart_is_a_rotation_and_the_nearest() -> None:
+    """Three of them: the matrix in their middle is a mirror."""
+    generator = torch.Generator().manual_seed(11)
+    given = 2.2 * torch.randn(3, 3, generator=generator, dtype=torch.float64)
+    matrices = matrix_from_axis_angle(given)
+    assert float(torch.linalg.det(matrices.mean(0))) < 0
+
+    def apart(rotations: torch.Tensor) -> torch.Tensor:
+        each = matrix_from_axis_angle(rotations)[:, None] - matrices
+        return each.square().sum((-1, -2, -3))
+
+    least = float(apart(_axis_angles(5000)).min())
+    assert float(apart(mean_rotation(given)[None])[0]) <= least + 1e-9
+
+
 def test_the_mean_rotation_agrees_with_scipy() -> None:
     middle = Rotation.from_rotvec([1.5, -2.0, 1.6])
     generator = torch.Generator().manual_seed(1)

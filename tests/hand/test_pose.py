@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from handavatar.geometry.rotations import apply_rigid, matrix_from_axis_angle
+from handavatar.geometry.rotations import apply_rigid, matrix_from_axis_angle, rigid_transform
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import (
     BONE_NAMES,
@@ -17,6 +17,7 @@ from handavatar.hand.pose import (
     linear_blend_skinning,
     skinning_jacobian,
 )
+from handavatar.hand.rig import ShapedHand
 
 
 def _poses(count: int, dtype: torch.dtype = torch.float64) -> Tensor:
@@ -160,3 +161,20 @@ def test_the_bone_tree_is_five_chains_on_a_wrist() -> None:
     assert sorted(b for bones in FINGER_BONES.values() for b in bones) == list(range(1, 16))
     for first, second, third in FINGER_BONES.values():
         assert [BONE_PARENTS[b] for b in (first, second, third)] == [0, first, second]
+
+
+def test_a_hand_in_other_axes_turns_about_its_own_wrist() -> None:
+    """Wherever its rest wrist lies: vertices and pose move alike."""
+    rig = load_open_hand("778")
+    aside, hand = torch.tensor([0.1, -0.05, 0.2]), rig.shaped()
+    hand = ShapedHand(rig, hand.rest_vertices + aside, hand.rest_joints + aside)
+    generator = torch.Generator().manual_seed(0)
+    pose = HandPose(
+        0.3 * torch.randn(NUM_BONES, 3, generator=generator), torch.tensor([0.3, 0.1, 0.5])
+    )
+    turn = matrix_from_axis_angle(torch.tensor([0.4, -0.9, 0.2]))
+    other = rigid_transform(turn, torch.tensor([0.2, 0.1, -0.3]))
+    moved = hand.posed(pose.moved_to(other, hand.rest_joints[0])).vertices
+    torch.testing.assert_close(
+        moved, apply_rigid(other, hand.posed(pose).vertices), atol=1e-5, rtol=0
+    )

@@ -26,6 +26,23 @@ def prior() -> PairOccupancy:
     return field
 
 
+def test_points_of_a_part_reach_a_centimetre_into_its_neighbours(rig: Rig, parts: Parts) -> None:
+    """Half of them are its own; the others lie on it and around it."""
+    hand = rig.shaped()
+    vertices, labels = hand.rest_vertices, parts.vertex_labels
+    for bone in range(NUM_BONES):
+        corners = parts.corner_indices[bone]
+        places = (vertices[corners] * parts.barycentric[bone][..., None]).sum(-2)
+        away = torch.cdist(places, vertices[labels == bone]).amin(-1)
+        half = len(places) // 2
+        has_own = (labels[corners] == bone).any(-1)
+        assert bool(has_own[:half].all())
+        # On faces of the neighbours alone; their corners lie within the centimetre, their middles
+        # are a face's width nearer or farther.
+        assert float((~has_own[half:]).float().mean()) > 0.05
+        assert float(away[half:].max()) < 0.022
+
+
 def _fist(rig: Rig) -> PosedHand:
     return rig.shaped().posed(HandPose(gesture_rotations(rig, "fist"), torch.zeros(3)))
 

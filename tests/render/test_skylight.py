@@ -27,6 +27,32 @@ def test_directions_are_unit_and_even() -> None:
         even_directions(0)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_shadow_ends_below_the_edge_that_casts_it(axis: int) -> None:
+    """A square over a line of points, moved by parts of a pixel of the depth picture."""
+    steps = torch.linspace(-0.1, 0.1, 2001)
+    points = torch.zeros(len(steps), 3)
+    points[:, axis] = steps
+    up = torch.tensor([[0.0, 0.0, 1.0]])
+    ground, ground_faces = square(0.2, -0.01)
+    beside = []
+    for part in range(10):
+        roof, faces = square(0.05, 0.05)
+        edge = 0.02 + 0.0005 * part
+        roof[:, axis] += edge - 0.05
+        vertices = torch.cat([ground, roof])
+        light = sky_light(
+            vertices, torch.cat([ground_faces, faces + 4]), points, up.expand_as(points), up
+        )[:, 0]
+        assert float(light.min()) >= 0 and float(light.max()) <= 1 + 1e-5
+        # As much light as there is beyond the edge, in metres; the other edge lies outside.
+        seen = light[steps > edge - 0.05].sum() * float(steps[1] - steps[0])
+        beside.append(0.1 - float(seen) - edge)
+    # The picture spans 0.58 m with 128 pixels, 4.5 mm each; its edges err by half of one either
+    # way, and by a tenth on the average.
+    assert abs(sum(beside) / len(beside)) < 0.0009
+
+
 def test_a_ball_sees_half_of_the_sky() -> None:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.08)
     vertices = torch.from_numpy(ball.vertices).float()

@@ -14,7 +14,7 @@ from conftest import (
 from handavatar.avatar import HandAvatar, RenderSettings
 from handavatar.capture.frames import Frame
 from handavatar.geometry.cameras import pixel_centers, rays_through_pixels
-from handavatar.train.border import border_pixels, fit_border
+from handavatar.train.border import BORDER_REACH, border_pixels, fit_border
 
 SETTINGS = RenderSettings(num_samples=24, smallest_weight=1e-6, stop=1e-5)
 FRAMES = [lit_frame(index, "train") for index in range(2)]
@@ -64,3 +64,15 @@ def test_border_pixels_lie_beside_the_border_and_nowhere_else() -> None:
     assert 560 < len(x) < 720 and len(torch.unique(x * 40 + y)) == len(x)
     assert len(border_pixels(mask, 100, generator)) == 100
     assert len(border_pixels(torch.zeros(9, 9), 10, generator)) == 0
+
+
+def test_where_knowledge_ends_there_is_no_border() -> None:
+    """A bar that goes on where nothing is known: its two sides are borders, its end is none."""
+    coverage, known = torch.zeros(40, 40), torch.ones(40, 40, dtype=torch.bool)
+    coverage[10:30, :20] = 1.0
+    known[:, 20:] = False
+    pixels = border_pixels(coverage, 10_000, torch.Generator().manual_seed(0), known)
+    x, y = pixels.unbind(-1)
+    assert len(pixels) > 100 and int(x.max()) < 20
+    sides = torch.minimum((y + 0.5 - 10).abs(), (y + 0.5 - 30).abs())
+    assert float(sides.max()) <= BORDER_REACH

@@ -4,6 +4,7 @@ A stop names what was not finite and when, leaves only checkpoints that are good
 do; whoever does that gets a finite avatar.
 """
 
+import json
 import math
 import re
 import shlex
@@ -592,6 +593,8 @@ def test_a_training_with_nan_ends_in_a_finite_avatar_or_a_clear_stop(
     if said.splitlines()[-1].startswith("give the same command again with "):
         again = shlex.split(said.splitlines()[-1].partition(" with ")[2])
         assert again[:-1] == ["--out", str(run), "--resume", "auto", "--seed"]
+        used = {use["seed"] for use in json.loads((run / "seeds.json").read_text())["seeds"]}
+        assert int(again[-1]) not in used
     else:
         assert re.search("drop the frame|check the capture|leave (it|them) out", said), said
     assert main([*_words(capture), *again]) == 0

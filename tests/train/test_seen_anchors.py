@@ -37,6 +37,18 @@ def test_anchors_count_as_the_vertices_beside_them(small_avatar: HandAvatar) -> 
     assert 0.2 < float((avatar.seen_frames == 0).float().mean()) < 0.8
 
 
+def test_an_anchor_is_seen_where_most_of_its_surroundings_are(small_avatar: HandAvatar) -> None:
+    avatar = copy.deepcopy(small_avatar)
+    with torch.no_grad():
+        avatar.shape.mlp.output.weight.zero_()
+    count_seen_anchors(avatar, FRAMES[:1])
+    seen = count_seen_skin(avatar.rig, torch.zeros(10), FRAMES[:1]).counts
+    share = (seen[avatar.anchor_corners] * avatar.anchors.barycentric).sum(-1)
+    assert bool(((share > 0.05) & (share < 0.5)).any())
+    assert avatar.seen_frames is not None
+    assert torch.equal(avatar.seen_frames, (share > 0.5).int())
+
+
 def test_the_avatar_keeps_it_in_its_file(small_avatar: HandAvatar, tmp_path: Path) -> None:
     avatar = _seen_from_above(small_avatar)
     avatar.save(tmp_path / "seen.safetensors")

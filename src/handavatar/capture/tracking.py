@@ -6,10 +6,9 @@ by 35 degrees either way. Their median is steadier than any one of them, and whe
 """
 
 import math
-from collections.abc import Iterable, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from types import TracebackType
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -231,47 +230,42 @@ class Finder(Protocol):
         ...
 
 
+@runtime_checkable
+class Detector(Protocol):
+    """What sees hands in one picture, or in one after the other."""
+
+    def detect(self, image: UInt8[np.ndarray, "height width 3"]) -> list[Sighting]:
+        """All hands of a picture, in its pixels and axes."""
+        ...
+
+
+class MediaPipeDetector:
+    """A graph of MediaPipe's hand models."""
+
+    def __init__(self, graph: Any) -> None:
+        """Takes a graph that is open: ``mediapipe.python.solutions.hands.Hands``."""
+        self._graph = graph
+
+    def detect(self, image: UInt8[np.ndarray, "height width 3"]) -> list[Sighting]:
+        """All hands of a picture."""
+        return _sightings(self._graph, image)
+
+
 class HandFinder:
-    """MediaPipe's hand models, opened once; a context manager."""
+    """Finds hands by two detectors: one follows them, the other looks at turned views of them."""
 
-    def __init__(self) -> None:
-        """Opens the models that ship in the mediapipe wheel.
+    def __init__(self, following: Detector, looking: Detector) -> None:
+        """Takes both detectors.
 
-        Raises:
-            CaptureError: mediapipe is not installed, or has no hand models.
+        Args:
+            following: is shown the pictures of a video in their order.
+            looking: is shown single views.
         """
-        hands = _mediapipe_hands()
-        self._tracker = hands(
-            static_image_mode=False,
-            max_num_hands=2,
-            model_complexity=1,
-            min_detection_confidence=0.5,
-            min_tracking_confidence=0.5,
-        )
-        self._still = hands(
-            static_image_mode=True,
-            max_num_hands=2,
-            model_complexity=1,
-            min_detection_confidence=0.3,
-        )
-
-    def __enter__(self) -> "HandFinder":
-        """Itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Closes both graphs."""
-        self._tracker.close()
-        self._still.close()
+        self._following, self._looking = following, looking
 
     def track(self, image: UInt8[np.ndarray, "height width 3"]) -> list[Sighting]:
         """All hands of the next picture of a video."""
-        return _without_doubles(_sightings(self._tracker, image))
+        return _without_doubles(self._following.detect(image))
 
     def look_closely(
         self,
@@ -293,10 +287,34 @@ class HandFinder:
         corner = center - picture_from_view @ np.array([_VIEW_SIDE / 2, _VIEW_SIDE / 2])
         view = resampled(image, picture_from_view, corner, _VIEW_SIDE)
         found = [
-            _turned(sighting, picture_from_view, corner)
-            for sighting in _sightings(self._still, view)
+            _turned(sighting, picture_from_view, corner) for sighting in self._looking.detect(view)
         ]
         return min(found, key=lambda s: _distance(s.landmarks, around), default=None)
+
+
+@contextmanager
+def mediapipe_finder() -> Iterator[HandFinder]:
+    """MediaPipe's hand models that ship in its wheel, opened once.
+
+    Raises:
+        CaptureError: mediapipe is not installed, or has no hand models.
+    """
+    hands = _mediapipe_hands()
+    tracker = hands(
+        static_image_mode=False,
+        max_num_hands=2,
+        model_complexity=1,
+        min_detection_confidence=0.5,
+        min_tracking_confidence=0.5,
+    )
+    still = hands(
+        static_image_mode=True,
+        max_num_hands=2,
+        model_complexity=1,
+        min_detection_confidence=0.3,
+    )
+    with closing(tracker), closing(still):
+        yield HandFinder(MediaPipeDetector(tracker), MediaPipeDetector(still))
 
 
 _USUAL_FRAMES = 60
@@ -323,7 +341,7 @@ def track_hand(
             only one is asked for.
         CaptureError: mediapipe is missing.
     """
-    opened = HandFinder() if finder is None else nullcontext(finder)
+    opened = mediapipe_finder() if finder is None else nullcontext(finder)
     with opened as used:
         seen, glances, picture_size = _all_hands(used, frames, which != "only", progress)
     if which == "only":

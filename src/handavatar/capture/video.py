@@ -1,6 +1,6 @@
 """A person's own video of one hand, made into a capture: track, mask, fit, crop, write."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -29,6 +29,7 @@ from handavatar.capture.own_finder import OwnFinder
 from handavatar.capture.picture_folders import frames_of, is_picture_source
 from handavatar.capture.seen_skin import count_seen_skin
 from handavatar.capture.tracking import (
+    Finder,
     Track,
     UnusableTrackError,
     has_mediapipe,
@@ -172,6 +173,7 @@ def capture_video(
     rig: Rig | None = None,
     progress: Progress = SILENT,
     track: Track | None = None,
+    open_finder: Callable[[], Finder] | None = None,
 ) -> Capture:
     """Makes a capture of a video of one hand, or of several of the same hand.
 
@@ -183,6 +185,8 @@ def capture_video(
         rig: the hand to lay onto the pictures; the one that the options name if None.
         progress: told how far it is.
         track: what the tracker found in the one video already; it is tracked if None.
+        open_finder: gives what finds the hand in a video, once for each; the tracker that the
+            options name if None.
 
     Returns:
         The capture as written. Frames that were left out stand with their reason in its
@@ -206,7 +210,7 @@ def capture_video(
     parts = stages["finding the hand"].equal_parts(len(videos))
     for number, (video, camera) in enumerate(zip(videos, cameras, strict=True)):
         try:
-            clips.append(_tracked_clip(video, rig, camera, parts[number], track))
+            clips.append(_tracked_clip(video, rig, camera, parts[number], track, open_finder))
         except UnusableTrackError as error:
             unusable = TriedClip(video.file.name, error.track, number=number)
             raise failure(options.out, error.what, error.remedy, [unusable]) from error
@@ -317,18 +321,23 @@ def _cropped(
     return [of_clip(number) for number in range(len(laid))]
 
 
-def track_video(options: VideoOptions, progress: Progress = SILENT) -> Track:
+def track_video(
+    options: VideoOptions,
+    progress: Progress = SILENT,
+    open_finder: Callable[[], Finder] | None = None,
+) -> Track:
     """Finds the hand in the pictures of a video.
 
     Args:
         options: which video, pictures and hand.
         progress: told how far it is.
+        open_finder: as for :func:`capture_video`.
 
     Raises:
         UnusableTrackError: there is no hand to go on with.
         CaptureError: the video cannot be read, or an extra is missing.
     """
-    return _tracked(options, None, progress).track
+    return _tracked(options, None, progress, open_finder).track
 
 
 @dataclass(eq=False)
@@ -340,13 +349,20 @@ class _Tracked:
     pinhole: Pinhole | None
 
 
-def _tracked(options: VideoOptions, camera: KnownCamera | None, progress: Progress) -> _Tracked:
+def _tracked(
+    options: VideoOptions,
+    camera: KnownCamera | None,
+    progress: Progress,
+    open_finder: Callable[[], Finder] | None,
+) -> _Tracked:
     if options.hand == "both":
         raise ArgumentError(
             "hand", "both makes two captures: ask for one of VideoOptions.of_each_hand"
         )
     notes: list[str] = []
-    is_own = options.tracker == "own" or (options.tracker == "auto" and not has_mediapipe())
+    is_own = open_finder is None and (
+        options.tracker == "own" or (options.tracker == "auto" and not has_mediapipe())
+    )
     if is_own and options.tracker == "auto":
         notes.append(
             "MediaPipe is not installed, so our own tracker alone finds the hand, less exactly "
@@ -366,10 +382,9 @@ def _tracked(options: VideoOptions, camera: KnownCamera | None, progress: Progre
         return replace(frame, image=pinhole.straighten(frame.image))
 
     frames = map(seen, frames_of(options.file, options.sampling(), notes.append))
+    finder = open_finder() if open_finder else OwnFinder() if is_own else None
     try:
-        track = track_hand(
-            frames, options.side, progress, options.hand, OwnFinder() if is_own else None
-        )
+        track = track_hand(frames, options.side, progress, options.hand, finder)
     except UnusableTrackError as error:
         told = replace(error.track, notes=tuple(notes))
         raise UnusableTrackError(error.what, error.remedy, told) from error
@@ -382,6 +397,7 @@ def _tracked_clip(
     camera: KnownCamera | None,
     progress: Progress,
     track: Track | None,
+    open_finder: Callable[[], Finder] | None,
 ) -> Clip:
     """One recording, with all that the user says of it."""
     has_moved = camera is not None and bool(camera.camera_from_world)
@@ -392,7 +408,7 @@ def _tracked_clip(
             "give the folder of the pictures that the cameras were found for; or a file without "
             "frames, if the camera stands still",
         )
-    found = _Tracked(track, {}, None) if track else _tracked(options, camera, progress)
+    found = _Tracked(track, {}, None) if track else _tracked(options, camera, progress, open_finder)
     track, pinhole = found.track, found.pinhole
     if camera is not None and has_moved:
         track = _of_known_cameras(track, found.names, camera)
