@@ -123,7 +123,7 @@ def test_errors_become_exit_codes_and_a_few_lines(
 def test_warnings_are_printed_once_with_flags_and_nothing_raw(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def warn(words: list[str]) -> int:
+    def warn(words: list[str], progress: Progress) -> int:
         """Warns."""
         logging.getLogger("handavatar.train.runs").warning("%s: use `overwrite=True`", "a\x1b[2J")
         return 0

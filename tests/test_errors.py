@@ -25,6 +25,7 @@ from handavatar.errors import (
 from handavatar.hand.rig import LicensedRigMissing
 from handavatar.jobs.files import FolderInUse
 from handavatar.jobs.finite import NotFinite
+from handavatar.jobs.progress import SILENT
 
 FLAG = re.compile(r"(^|[\s(\[\"'`])--[a-z]")
 # What is no flag of ours, or speaks of the command line as such.
@@ -78,7 +79,7 @@ def _commands(monkeypatch: pytest.MonkeyPatch) -> dict[str, _Options]:
         for name in [*names, *(f"bench --table {table}" for table in bench._TABLES)]:
             words = name.split()
             with pytest.raises(_Asked):
-                cli.COMMANDS["bench" if words[0] == "bench" else name](words[1:])
+                cli.COMMANDS["bench" if words[0] == "bench" else name](words[1:], SILENT)
             found[name] = asked[-1]
     return found
 
@@ -222,7 +223,7 @@ def _outcome(command: str, words: list[str], monkeypatch: pytest.MonkeyPatch) ->
     with monkeypatch.context() as patched:
         patched.setattr(arguments, "parse_with", parse)
         try:
-            cli.COMMANDS["bench" if command.startswith("bench") else command](words)
+            cli.COMMANDS["bench" if command.startswith("bench") else command](words, SILENT)
         except (Exception, SystemExit, _Taken) as error:
             return error
     raise AssertionError("parsing always ends in an error here")

@@ -207,16 +207,16 @@ def test_a_slip_is_named(
 @pytest.mark.parametrize(
     ("words", "code", "says"),
     [
-        ("render RUN --device mps", 2, "--device mps: expected auto, cpu, cuda"),
-        ("render RUN --device gpu", 2, "--device gpu: expected auto, cpu, cuda"),
-        ("view RUN --device cuda:x", 2, "--device cuda:x: expected"),
-        ("render RUN --device cuda:99", 2, "--device cuda:99: (no CUDA device|torch sees)"),
-        ("capture video video.mp4 --out O --fps 0", 2, "--fps 0: expected"),
-        ("capture video video.mp4 --out O --max-frames 0", 2, "--max-frames 0: expected"),
-        ("edit RUN --out O --light-gain -1", 2, "--light-gain and --albedo-shift: expected"),
+        ("render RUN --device mps", 2, "--device: found mps, expected auto, cpu, cuda"),
+        ("render RUN --device gpu", 2, "--device: found gpu, expected auto, cpu, cuda"),
+        ("view RUN --device cuda:x", 2, "--device: found cuda:x, expected"),
+        ("render RUN --device cuda:99", 2, "--device: .*cuda:99, (but no CUDA device|expected)"),
+        ("capture video video.mp4 --out O --fps 0", 2, "--fps: found 0.0, expected"),
+        ("capture video video.mp4 --out O --max-frames 0", 2, "--max-frames: found 0, expected"),
+        ("edit RUN --out O --light-gain -1", 2, "--light-gain: found -1.0, expected"),
         ("capture degrade captures/capture --out .", 3, "the command was started in"),
         ("render RUN --out .", 2, "the command was started in"),
-        ("train captures/capture --steps 0", 2, "--steps 0: expected at least 1"),
+        ("train captures/capture --steps 0", 2, "--steps: found 0, expected at least 1"),
     ],
 )
 def test_a_value_that_makes_no_sense_is_named(

@@ -247,7 +247,7 @@ def test_a_rank_without_other_processes_is_alone(monkeypatch: pytest.MonkeyPatch
     assert not is_first_process()
 
 
-def test_a_world_without_torchrun_is_wrong_usage(
+def test_a_world_without_torchrun_is_named(
     small_avatar: HandAvatar,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -258,5 +258,5 @@ def test_a_world_without_torchrun_is_wrong_usage(
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("WORLD_SIZE", "2")
     words = ["render", str(tmp_path / "a.safetensors"), "--out", str(tmp_path / "o")]
-    assert cli.main([*words, "--size", "8", "--frames", "1"]) == USAGE
+    assert cli.main([*words, "--size", "8", "--frames", "1"]) == BAD_DATA
     assert "unset WORLD_SIZE" in capsys.readouterr().err

@@ -151,7 +151,7 @@ def test_import_writes_where_it_is_told_and_nothing_else(
     assert cli.main(words) == 0
     assert f"--rig {out}" in capsys.readouterr().out
     assert not home.exists() and load_rig(str(out)).name == "mano-left"
-    assert cli.main(words) == 3
+    assert cli.main(words) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert cli.main([*words, "--overwrite", "--left-shape", "kept"]) == 0
 

@@ -88,7 +88,7 @@ def _aligned(frames: list[Frame]) -> list[Tensor]:
 
 
 def _mean_colors(frames: list[Frame]) -> list[Tensor]:
-    return [mean_color([frame.colors for frame in frames], [frame.mask for frame in frames])]
+    return [mean_color((frame.colors, frame.mask) for frame in frames)]
 
 
 def _texture(frames: list[Frame]) -> list[Tensor]:

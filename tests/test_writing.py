@@ -11,6 +11,7 @@ ALLOWED = {
     "handavatar.capture.degraded": "into a capture's folder, which is filled aside",
     "handavatar.capture.video": "into a capture's folder, which is filled aside",
     "handavatar.train.runs": "a checkpoint's folder is filled aside; a log grows by lines; a lock",
+    "handavatar.jobs.locks": "who holds a lock, told by whoever holds it",
     "handavatar.jobs.video_writer": "a film is encoded aside",
     "handavatar.view.recording": "grows by pieces, and takes its place when it is whole",
 }

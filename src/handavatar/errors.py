@@ -126,6 +126,7 @@ def argument(name: str, value: object = None) -> str:
     return f"`{name}`" if value is None else f"`{name}={shown!r}`"
 
 
+_VAST = 10**6
 SEEDS = (0, 2**32 - 1)
 """What all generators here take as a seed."""
 
@@ -161,7 +162,9 @@ def require_range(name: str, value: object, least: int | float, most: int | floa
         if number is None:
             continue
         if not (isinstance(number, int | float) and least <= number <= most):
-            raise ArgumentError(name, str(number)[:40], f"{_plain(least)} to {_plain(most)}")
+            is_small = isinstance(number, int | float) and number < least and most >= _VAST
+            span = f"at least {least:g}" if is_small else f"{_plain(least)} to {_plain(most)}"
+            raise ArgumentError(name, str(number)[:40], span)
 
 
 def _plain(number: int | float) -> str:

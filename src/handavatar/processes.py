@@ -8,15 +8,13 @@ from dataclasses import dataclass
 import torch
 import torch.distributed
 
-from handavatar.errors import ErrorKind, HandAvatarError
+from handavatar.errors import HandAvatarError
 
 _OF_TORCHRUN = ("RANK", "MASTER_ADDR", "MASTER_PORT")
 
 
 class ProcessesError(HandAvatarError):
     """An environment that speaks of several processes, but does not say where they are."""
-
-    kind = ErrorKind.USAGE
 
 
 @dataclass(frozen=True)

@@ -266,7 +266,7 @@ def test_no_frames_and_frames_without_a_hand_are_refused() -> None:
 
 def test_the_mean_color_is_the_best_single_color() -> None:
     images, masks = [blobs(0), blobs(1)], [disc(10), disc(14)]
-    color = mean_color(images, masks)
+    color = mean_color(zip(images, masks, strict=True))
     pixels = torch.cat([images[0][masks[0]], images[1][masks[1]]])
     assert torch.allclose(color, pixels.mean(0))
     judged = JudgedFrame(torch.zeros(48, 40, 3), masks[1], images[0], masks[0].float())

@@ -384,7 +384,7 @@ def test_large_pictures_are_judged_binned_unless_asked_for_whole(
         assert "Skin that was never seen" in (out / "report.html").read_text()
         with Image.open(out / "000002.png") as strip:
             assert strip.height == side
-        notes = [note for note in metrics["notes"] if "--full-size" in note]
+        notes = [note for note in metrics["notes"] if "`full_size`" in note]
         assert bool(notes) != full_size
         assert metrics["truth"] is not None and metrics["truth"]["albedo_psnr"] > 0
     assert "48 pixels along a side, of 96" in "".join(

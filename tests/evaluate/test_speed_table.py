@@ -82,7 +82,7 @@ def test_the_camera_holds_the_whole_hand(small_avatar: HandAvatar) -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"), [({"poses": 0}, "--poses"), ({"plain_rays": 257}, "--plain-rays")]
+    ("wrong", "message"), [({"poses": 0}, "`poses`"), ({"plain_rays": 257}, "`plain_rays`")]
 )
 def test_what_cannot_be_timed_is_refused(
     options: SpeedTableOptions, wrong: dict[str, int], message: str

@@ -107,7 +107,7 @@ def test_both_learn_the_hand_and_the_same_seed_the_same_bits(
     avatar: HandAvatar, frames: list[Frame], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(textured_mesh, "NUM_TEXELS", 2000)
-    color = mean_color([f.image.float() / 255 for f in frames], [f.mask for f in frames])
+    color = mean_color((f.image.float() / 255, f.mask) for f in frames)
     train, test = frames[:3], frames[3]
     mesh = [fit_textured_mesh(avatar, train, color, steps, 0)(test) for steps in (1, 80, 80)]
     assert _psnr(mesh[1], test) > max(_psnr(mesh[0], test) + 2, 20)

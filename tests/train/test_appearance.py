@@ -14,6 +14,7 @@ from handavatar.train.appearance import (
     SeenSamples,
     appearance_loss,
     find_seen_samples,
+    samples_of_frames,
     with_hidden_poses,
 )
 from handavatar.train.prior import load_prior
@@ -63,3 +64,20 @@ def test_a_hidden_pose_changes_the_light_of_its_frame_alone(
         pixels = (frame == number).nonzero()[:, 0]
         losses = [float(appearance_loss(avatar, part, pixels)[1]) for part in (seen, shown)]
         assert (losses[0] == losses[1]) == (number > 0)
+
+
+def test_samples_of_some_frames_are_those_of_these_alone(
+    seen: SeenSamples,
+) -> None:
+    some = samples_of_frames(seen, [0, 2])
+    is_some = (seen.frames == 0) | (seen.frames == 2)
+    first = seen.frames[seen.starts[:-1]]
+    of_pixels = (first == 0) | (first == 2)
+    assert torch.equal(some.weights, seen.weights[is_some])
+    assert torch.equal(some.neighbours.indices, seen.neighbours.indices[is_some])
+    assert torch.equal(some.colors, seen.colors[of_pixels])
+    assert torch.equal(some.starts.diff(), seen.starts.diff()[of_pixels])
+    assert some.frames.unique().tolist() == [0, 1]
+    assert torch.equal(some.rotations, seen.rotations[[0, 2]])
+    whole = samples_of_frames(seen, range(len(seen.rotations)))
+    assert all(torch.equal(value, seen.tensors()[n]) for n, value in whole.tensors().items())

@@ -120,7 +120,7 @@ def test_a_prior_that_diverges_says_how_to_go_on(
 ) -> None:
     """With a folder from its last checkpoint, without one from the file, or from the beginning."""
     options = replace(_options(tmp_path / "a"), steps=4, checkpoint_every=2)
-    with_folder = replace(options, folder=tmp_path / "run")
+    with_folder = replace(options, folder=tmp_path / "run", overwrite=True)
     advance = torch.optim.Adam.step
 
     def diverging(at: int, state: bool) -> None:
@@ -144,14 +144,14 @@ def test_a_prior_that_diverges_says_how_to_go_on(
     diverging(4, True)
     with pytest.raises(NotFinite, match=r"step 4: adam\.\d+\.exp_avg_sq holds inf") as caught:
         train_prior(options)
-    assert f"`start_from='{tmp_path / 'a'}'` `seed=1`" in str(caught.value)
+    assert f"`start_from='{tmp_path / 'a'}'` `overwrite=True` `seed=1`" in str(caught.value)
     diverging(3, False)
     with pytest.raises(NotFinite, match=r"step 3(.|\n)*checkpoint of step 2 is good") as caught:
         train_prior(with_folder)
     assert f"`folder='{tmp_path / 'run'}'` `seed=1`" in str(caught.value)
     monkeypatch.setattr(torch.optim.Adam, "step", advance)
     for again in (
-        replace(options, start_from=tmp_path / "a", seed=1),
+        replace(options, start_from=tmp_path / "a", overwrite=True, seed=1),
         replace(with_folder, seed=1),
         replace(with_folder, seed=1),  # It is the run's own seed by now.
     ):

@@ -99,7 +99,7 @@ def test_processes_that_cannot_share_evenly_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(prior, "joined_processes", lambda _: nullcontext(Processes(0, 3, "cpu")))
-    with pytest.raises(ValueError, match="2 poses a step for 3 processes"):
+    with pytest.raises(ValueError, match="found 2 a step for 3 processes"):
         train_prior(_options(tmp_path / "a", 1))
 
 

@@ -1,6 +1,7 @@
 """The server as a stranger meets it: over its socket."""
 
 import contextlib
+import errno
 import http.client
 import io
 import json
@@ -388,15 +389,21 @@ def test_dragging_ends_the_picture_in_full_that_is_being_made(server: ViewServer
 def test_a_failure_of_ours_is_told_and_the_server_goes_on(
     server: ViewServer, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    def broken(*_: Any) -> None:
-        raise MemoryError("as much as there is")
+    for error, said in (
+        (KeyError("of ours"), "KeyError: 'of ours'"),
+        (MemoryError("as much as there is"), "out of memory (as much as there is)"),
+        (OSError(errno.ENOSPC, "No space left on device", "/d"), "/d: No space left on device"),
+    ):
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Studio, "fluid", broken)
-        content = {"client": "x", "order": 1, "scene": SCENE}
-        status, data, _ = ask(server, "/picture", content)
-    assert status == 500 and b"MemoryError" in data
-    assert "MemoryError" in capfd.readouterr().err
+        def broken(*_: Any, error: Exception = error) -> None:
+            raise error
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Studio, "fluid", broken)
+            content = {"client": "x", "order": 1, "scene": SCENE}
+            status, data, _ = ask(server, "/picture", content)
+        assert status == 500 and json.loads(data)["error"].startswith(said)
+        assert f"view: {said}" in capfd.readouterr().err
     assert_alive(server)
 
 

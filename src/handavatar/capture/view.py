@@ -1,5 +1,6 @@
 """The typical view of a capture."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -12,7 +13,7 @@ from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.pose import HandPose
 
 
-def view_of(frames: list[Frame]) -> dict[str, Any]:
+def view_of(frames: Sequence[Frame]) -> dict[str, Any]:
     """The typical view of a capture, as JSON: what an avatar keeps of where its hand was seen.
 
     It is the training frame whose wrist orientation is nearest to all others'. Light is part of

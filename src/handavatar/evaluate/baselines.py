@@ -23,10 +23,7 @@ def training_color(capture: Capture) -> Float[Tensor, "3"] | None:
     frames = [frame for frame in frames if bool(frame.mask.any())]
     if not frames:
         return None
-    return mean_color(
-        [frame.colors for frame in frames],
-        [frame.mask for frame in frames],
-    )
+    return mean_color((frame.colors, frame.mask) for frame in frames)
 
 
 def textured_mesh_psnr(

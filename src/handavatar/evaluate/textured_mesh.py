@@ -4,7 +4,7 @@ The personal mesh of the capture is rasterised, its texture is a colour per texe
 function of the normal alone, nine harmonics in the world's axes. Nothing casts a shadow.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -94,7 +94,7 @@ def mesh_points(
 
 def fit_textured_mesh(
     avatar: HandAvatar,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     color: Float[Tensor, "3"],
     steps: int,
     seed: int,

@@ -18,6 +18,7 @@ import safetensors.torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from handavatar.errors import raise_if_refused
 from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import find_not_finite, require_finite
 from handavatar.jobs.signals import unbroken
@@ -195,6 +196,7 @@ def _read_state(path: Path, expected: Json) -> WorkState | None:
         if found := find_not_finite({**tensors, "facts": record}):
             raise ValueError(found)
     except (OSError, ValueError, KeyError, TypeError, RecursionError, SafetensorError) as error:
+        raise_if_refused(error)
         _log.warning("%s: cannot be gone on from (%s)", path, error)
         return None
     return WorkState(tensors, record)

@@ -7,7 +7,7 @@ not depend on the number of threads.
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
@@ -51,15 +51,16 @@ def mapped(
     """
     does_heed = heeds()
 
-    def without_gradient(piece: Piece) -> Result:
+    def without_gradient(number: int) -> Result:
         # Gradient mode and inner threads belong to the thread, not to the process.
         torch.set_num_threads(1)
         heed(does_heed)
         stop_point()
         with torch.no_grad():
-            return function(piece)
+            return function(work[number])
 
-    work = list(pieces)
+    # Of a sequence, each piece when its turn comes: it may be made then.
+    work = pieces if isinstance(pieces, Sequence) else list(pieces)
     before = torch.get_num_threads()
     count = before if count is None else count
     results: list[Result] = []
@@ -71,7 +72,7 @@ def mapped(
                 progress(len(results), len(work))
         return results
     try:
-        for result in _pool(count).map(without_gradient, work):
+        for result in _pool(count).map(without_gradient, range(len(work))):
             results.append(result)
             progress(len(results), len(work))
         return results

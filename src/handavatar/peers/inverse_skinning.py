@@ -5,7 +5,7 @@ moved a little by a network of the pose, and looked up in a field that knows col
 together. Shape, skin and light are one thing.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -162,7 +162,7 @@ def seen_along(
 
 
 def fit_inverse_skinning(
-    avatar: HandAvatar, frames: list[Frame], steps: int, seed: int, stride: int = 2
+    avatar: HandAvatar, frames: Sequence[Frame], steps: int, seed: int, stride: int = 2
 ) -> Callable[[Frame], Float[Tensor, "height width 4"]]:
     """Fits the field to colours and masks.
 

@@ -282,7 +282,7 @@ class FittedGeometry:
     """
 
     avatar: HandAvatar
-    frames: list[Frame]
+    frames: Sequence[Frame]
     anchors: Float[Tensor, "anchors 3"]
     seen: SeenSamples
     views: list[View]
@@ -321,7 +321,7 @@ def fitted_geometry(capture: Capture, shape: Shape, method: Method, seed: int) -
         seen,
         views,
         [_turned(avatar, tests[number], replace(settings, num_samples=256)) for number in chosen],
-        mean_color([frame.colors for frame in frames], [frame.mask for frame in frames]),
+        mean_color((frame.colors, frame.mask) for frame in frames),
         [_hidden(view.samples, avatar) for view in views],
     )
 

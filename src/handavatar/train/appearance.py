@@ -5,7 +5,7 @@ anchors and what lies before them stay the same. They are found once; then a ste
 small networks and can look at pixels of all frames at once.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -75,7 +75,7 @@ class SeenSamples:
 @torch.no_grad()
 def find_seen_samples(
     avatar: HandAvatar,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     settings: RenderSettings,
     stride: int,
     progress: Progress = SILENT,
@@ -159,6 +159,38 @@ def chosen_samples(
     ray = torch.arange(len(pixels), device=pixels.device).repeat_interleave(count)
     first = count.cumsum(0) - count
     return begin[ray] + torch.arange(len(ray), device=pixels.device) - first[ray], ray
+
+
+def samples_of_frames(seen: SeenSamples, numbers: Sequence[int]) -> SeenSamples:
+    """What pixels of some of the frames see.
+
+    Args:
+        seen: of all frames.
+        numbers: of the frames that are wanted, ascending; they are counted anew.
+    """
+    device = seen.frames.device
+    places = torch.full((len(seen.rotations),), -1, device=device)
+    places[torch.tensor(numbers, device=device)] = torch.arange(len(numbers), device=device)
+    counts = seen.starts.diff()
+    # A pixel has at least one sample.
+    pixels = (places[seen.frames[seen.starts[:-1]]] >= 0).nonzero()[:, 0]
+    samples, _ = chosen_samples(seen, pixels)
+    starts = counts[pixels].cumsum(0)
+    near = seen.neighbours
+    return SeenSamples(
+        weights=seen.weights[samples],
+        directed=seen.directed[samples],
+        neighbours=Neighbours(near.indices[samples], near.weights[samples]),
+        normals=seen.normals[samples],
+        light=seen.light[samples],
+        frames=places[seen.frames[samples]],
+        starts=torch.cat([torch.zeros_like(starts[:1]), starts]),
+        colors=seen.colors[pixels],
+        alpha=seen.alpha[pixels],
+        points=seen.points[pixels],
+        rotations=seen.rotations[torch.tensor(numbers, device=device)],
+        clips=seen.clips[torch.tensor(numbers, device=device)],
+    )
 
 
 def with_hidden_poses(seen: SeenSamples, share: float, generator: torch.Generator) -> SeenSamples:

@@ -4,6 +4,7 @@ Occupancy points say where the surface is; along a grazing ray their uncertainty
 picture's outline lies outside of it. Rays beside the border see the sum itself.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -41,7 +42,7 @@ class _Border:
 
 def fit_border(
     avatar: HandAvatar,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     steps: int,
     settings: RenderSettings,
     seed: int,
@@ -86,7 +87,7 @@ def fit_border(
     descend("border", decoder, steps, rates, loss_of_step, generator, parts["border"], kept)
 
 
-def _borders(avatar: HandAvatar, frames: list[Frame], progress: Progress) -> list[_Border]:
+def _borders(avatar: HandAvatar, frames: Sequence[Frame], progress: Progress) -> list[_Border]:
     def border(frame: Frame) -> _Border:
         pose, camera = frame.pose.to(avatar.device), frame.camera.to(avatar.device)
         codes = avatar.occupancy.encode(avatar.parts, avatar.personal(pose).posed(pose))

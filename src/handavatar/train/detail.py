@@ -6,6 +6,7 @@ hundreds of them fit into a minute.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -109,7 +110,7 @@ class LearnedDetail:
 
 @torch.no_grad()
 def find_detail_views(
-    avatar: HandAvatar, frames: list[Frame], seen: SeenSamples, progress: Progress = SILENT
+    avatar: HandAvatar, frames: Sequence[Frame], seen: SeenSamples, progress: Progress = SILENT
 ) -> list[DetailView]:
     """Every pixel that the hand covers, in every frame, without a march along its ray.
 
@@ -212,7 +213,7 @@ def _view_of(
 
 def learn_detail(
     avatar: HandAvatar,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     seen: SeenSamples,
     size: int,
     steps: int,
@@ -283,7 +284,7 @@ class UnwrappedTexture:
 @torch.no_grad()
 def unwrap_frames(
     avatar: HandAvatar,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     views: list[DetailView],
     progress: Progress = SILENT,
 ) -> UnwrappedTexture:

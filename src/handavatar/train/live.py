@@ -15,7 +15,7 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -137,7 +137,7 @@ def shown_live(
     run: Run,
     avatar: HandAvatar,
     corrections: PoseCorrections | None,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     progress: Progress,
 ) -> Iterator[Progress]:
     """While it lasts, others can see how far the training is.
@@ -171,13 +171,13 @@ class _Live:
         run: Run,
         avatar: HandAvatar,
         corrections: PoseCorrections | None,
-        frames: list[Frame],
+        frames: Sequence[Frame],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._run = run
         self._avatar = avatar
         self._corrections = corrections
-        self._frames = frames
+        self._poses = [frame.pose for frame in frames]
         self._clock = clock
         self._last: dict[str, Any] = {}
         self._told = self._shown = -1e9
@@ -254,8 +254,8 @@ class _Live:
         if self._corrections is not None:
             with torch.no_grad():
                 poses = [
-                    self._corrections(number, frame.pose.to(self._avatar.device))
-                    for number, frame in enumerate(self._frames)
+                    self._corrections(number, pose.to(self._avatar.device))
+                    for number, pose in enumerate(self._poses)
                 ]
             live["poses"] = {
                 "rotations": [pose.rotations.tolist() for pose in poses],

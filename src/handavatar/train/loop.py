@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from hashlib import sha256
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from handavatar import __version__
 from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar, RenderSettings, chosen_device
+from handavatar.capture.frame_sequence import FrameSequence, change_frames, choose_frames
 from handavatar.capture.frames import FITTED_SIDE, Capture, CaptureError, Frame, read_capture
 from handavatar.capture.soundness import require_sound
 from handavatar.capture.view import view_of
@@ -43,6 +44,7 @@ from handavatar.train.appearance import (
     SeenSamples,
     appearance_loss,
     find_seen_samples,
+    samples_of_frames,
     with_hidden_poses,
 )
 from handavatar.train.border import border_pixels, fit_border
@@ -179,6 +181,10 @@ class Method:
 
 _DETAILED_FRAMES = 256
 """So many frames, evenly spread, give the detail their large pictures: about 7 MB each."""
+_MOST_DETAIL_FRAMES = 500
+"""So many, evenly spread, have a say in the detail at all."""
+_SEEN_FRAMES = 500
+"""Of more frames, fewer pixels of each are looked at again and again."""
 _DETAIL_STRIDE = 4
 """Where no pixels were found before, every so-manieth tells the detail of the light."""
 
@@ -458,8 +464,10 @@ def _require_finite_step(training: Training, figures: dict[str, float], step: in
         raise NotFinite(f"step {step}: {'; '.join(text for text in found if text)}")
 
 
-def training_frames(capture: Capture, method: Method, progress: Progress = SILENT) -> list[Frame]:
-    """The frames of split ``train``, as large as the method takes them.
+def training_frames(
+    capture: Capture, method: Method, progress: Progress = SILENT
+) -> Sequence[Frame]:
+    """The frames of split ``train``, as large as the method takes them, read when needed.
 
     Args:
         capture: that holds them.
@@ -469,17 +477,20 @@ def training_frames(capture: Capture, method: Method, progress: Progress = SILEN
     Raises:
         CaptureError: if a frame is damaged, or a number of it is not finite.
     """
-    frames: list[Frame] = []
     indices = capture.split("train")
-    for index in indices:
-        progress(len(frames), len(indices))
-        frame = capture.frame(index)
+
+    def read(number: int) -> Frame:
+        frame = capture.frame(indices[number])
+        return frame if method.picture_size is None else frame.binned(method.picture_size)
+
+    frames = FrameSequence(read, len(indices))
+    for number, frame in enumerate(frames):
+        progress(number, len(frames))
         frame.require_finite()
-        frames.append(frame if method.picture_size is None else frame.binned(method.picture_size))
     return frames
 
 
-def frames_of_clips(capture: Capture, frames: list[Frame]) -> list[list[Frame]]:
+def frames_of_clips(capture: Capture, frames: Sequence[Frame]) -> list[Sequence[Frame]]:
     """The training frames of each clip.
 
     Args:
@@ -489,21 +500,24 @@ def frames_of_clips(capture: Capture, frames: list[Frame]) -> list[list[Frame]]:
     Raises:
         CaptureError: if a clip has none: its light could not be learned.
     """
-    clips = [[frame for frame in frames if frame.clip == clip] for clip in range(capture.num_clips)]
-    for clip, own in enumerate(clips):
-        if not own:
+    clips = [frame.clip for frame in frames]
+    found = []
+    for clip in range(capture.num_clips):
+        numbers = [number for number, own in enumerate(clips) if own == clip]
+        if not numbers:
             raise CaptureError(
                 f"{capture.folder}: clip {clip} has no frame of split 'train', from which its "
                 "light could be learned",
                 "mark some of its frames as split: train, and number the clips from 0 without gaps",
             )
-    return clips
+        found.append(choose_frames(frames, numbers))
+    return found
 
 
 def _learn_detail(
     training: Training,
     capture: Capture,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     seen: SeenSamples | None,
     perceptual: PerceptualLoss,
     method: Method,
@@ -521,8 +535,12 @@ def _learn_detail(
     if seen is None:
         settings = RenderSettings(num_samples=method.num_samples)
         small = corrected_frames(training, frames)
-        seen = find_seen_samples(avatar, small, settings, _DETAIL_STRIDE, parts["samples"])
+        stride = _DETAIL_STRIDE * _thinning(len(frames))
+        seen = find_seen_samples(avatar, small, settings, stride, parts["samples"])
     corrected = corrected_frames(training, _detailed_frames(capture, frames))
+    if len(frames) > _MOST_DETAIL_FRAMES:
+        numbers = _spread(len(frames), _MOST_DETAIL_FRAMES)
+        seen, corrected = samples_of_frames(seen, numbers), choose_frames(corrected, numbers)
     learned = learn_detail(
         avatar,
         corrected,
@@ -543,7 +561,17 @@ def _learn_detail(
     }
 
 
-def _detailed_frames(capture: Capture, frames: list[Frame]) -> list[Frame]:
+def _spread(count: int, most: int) -> list[int]:
+    """Numbers of as many frames as may be, evenly spread."""
+    return torch.linspace(0, count - 1, min(count, most)).round().long().tolist()
+
+
+def _thinning(num_frames: int) -> int:
+    """By how much pixels lie further apart, so that those of very many frames are not more."""
+    return math.ceil(math.sqrt(max(1.0, num_frames / _SEEN_FRAMES)))
+
+
+def _detailed_frames(capture: Capture, frames: Sequence[Frame]) -> Sequence[Frame]:
     """The training frames as the capture stores them; of very many, some stay binned.
 
     Args:
@@ -551,16 +579,13 @@ def _detailed_frames(capture: Capture, frames: list[Frame]) -> list[Frame]:
         frames: as large as training takes them.
     """
     indices = capture.split("train")
-    places = torch.linspace(0, len(frames) - 1, min(len(frames), _DETAILED_FRAMES))
-    whole = set(places.round().long().tolist())
+    whole = set(_spread(len(frames), _DETAILED_FRAMES))
 
-    def is_stored(number: int) -> bool:
-        return capture.records[indices[number]].camera == frames[number].camera
+    def detailed(number: int, frame: Frame) -> Frame:
+        is_large = number in whole and capture.records[indices[number]].camera != frame.camera
+        return capture.frame(indices[number]) if is_large else frame
 
-    return [
-        frame if number not in whole or is_stored(number) else capture.frame(indices[number])
-        for number, frame in enumerate(frames)
-    ]
+    return change_frames(frames, detailed)
 
 
 @contextmanager
@@ -578,7 +603,7 @@ def _repeatable(device: torch.device) -> Iterator[None]:
 
 
 def begin_training(
-    capture: Capture, frames: list[Frame], method: Method, options: TrainOptions
+    capture: Capture, frames: Sequence[Frame], method: Method, options: TrainOptions
 ) -> Training:
     """An untrained avatar of the capture's person with the prior's geometry, and its optimisers.
 
@@ -604,9 +629,7 @@ def begin_training(
         num_lights=capture.num_clips,
     )
     load_prior(avatar.occupancy, options.prior)
-    avatar.start_from_color(
-        mean_color([frame.colors for frame in frames], [frame.mask for frame in frames])
-    )
+    avatar.start_from_color(mean_color((frame.colors, frame.mask) for frame in frames))
     wrists = torch.stack([frame.pose.rotations[0] for frame in frames])
     avatar.illumination.wrist_reference.copy_(mean_rotation(wrists))
     avatar.occupancy.encoder.requires_grad_(False)
@@ -647,7 +670,7 @@ def _fit_or_restore_outlines(
     run: Run,
     checkpoint: Checkpoint | None,
     training: Training,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     method: Method,
     options: TrainOptions,
     stages: dict[str, Progress],
@@ -695,7 +718,7 @@ _GEOMETRY_STAGES = ("registration", "outlines", "occupancy", "border")
 
 def fit_geometry(
     training: Training,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     method: Method,
     seed: int,
     stages: Mapping[str, Progress] | None = None,
@@ -813,7 +836,7 @@ def _light_directions(training: Training) -> Tensor:
 
 def _seen_samples(
     training: Training,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     method: Method,
     checkpoint: Checkpoint | None,
     seed: int,
@@ -834,7 +857,7 @@ def _seen_samples(
         parts["samples"].skip()
     else:
         state = states.begin("samples", lambda: WorkState({}))
-        stride = method.warm_stride
+        stride = method.warm_stride * _thinning(len(frames))
         seen = find_seen_samples(avatar, corrected, settings, stride, parts["samples"], state)
     if states.is_done("light"):
         directions.copy_(placed)
@@ -854,13 +877,15 @@ def _seen_samples(
 
 
 @torch.no_grad()
-def corrected_frames(training: Training, frames: list[Frame]) -> list[Frame]:
+def corrected_frames(training: Training, frames: Sequence[Frame]) -> Sequence[Frame]:
     """The frames with their poses as training sees them."""
     device = training.avatar.device
-    return [
-        replace(frame, pose=corrected_pose(training.corrections, frame, number, device))
+    # The poses of now, whenever a frame is needed.
+    poses = [
+        corrected_pose(training.corrections, frame, number, device)
         for number, frame in enumerate(frames)
     ]
+    return change_frames(frames, lambda number, frame: replace(frame, pose=poses[number]))
 
 
 def _recalled(
@@ -889,7 +914,7 @@ def warm_step(
 
 def train_step(
     training: Training,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     seen: SeenSamples | None,
     edges: EdgeSet,
     perceptual: PerceptualLoss,

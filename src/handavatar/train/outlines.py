@@ -5,6 +5,7 @@ whose outline is nearly that of the fine one, a frame costs a twentieth of a joi
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -93,7 +94,7 @@ def shape_losses(
 def fit_outlines(
     avatar: HandAvatar,
     corrections: PoseCorrections | None,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     rounds: int,
     visits: int,
     size: int,
@@ -208,7 +209,7 @@ def corrected_pose(
 
 
 def _align(
-    avatar: HandAvatar, corrections: PoseCorrections, frames: list[Frame], numbers: list[int]
+    avatar: HandAvatar, corrections: PoseCorrections, frames: Sequence[Frame], numbers: list[int]
 ) -> None:
     def align(number: int) -> None:
         frame = frames[number]
@@ -230,7 +231,7 @@ def _align(
 def _shape_step(
     avatar: HandAvatar,
     corrections: PoseCorrections | None,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     masks: list[tuple[Float[Tensor, "size size"], Bool[Tensor, "size size"] | None]],
     edges: EdgeSet,
     chosen: list[int],

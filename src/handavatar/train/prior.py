@@ -283,7 +283,8 @@ def _way_from(options: PriorOptions, written: int) -> str:
         return f"{again} `seed={options.seed + 1}`"
     return (
         f"{options.out} holds the weights of step {written}, which are good\n"
-        f"{again} {argument('start_from', options.out)} `seed={options.seed + 1}`"
+        f"{again} {argument('start_from', options.out)} `overwrite=True` "
+        f"`seed={options.seed + 1}`"
     )
 
 

@@ -6,6 +6,7 @@ fitted to the training pictures, and most directions are placed where it is brig
 several clips, each has a sky of its own, and they share the directions.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -37,7 +38,7 @@ _AT_ONCE = 8
 
 def place_directions(
     avatar: HandAvatar,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     seen: SeenSamples,
     seed: int,
     progress: Progress = SILENT,
@@ -131,7 +132,7 @@ def bright_directions(
 @torch.no_grad()
 def relit(
     avatar: HandAvatar,
-    frames: list[Frame],
+    frames: Sequence[Frame],
     seen: SeenSamples,
     progress: Progress = SILENT,
     kept: StageState = NOT_KEPT,
