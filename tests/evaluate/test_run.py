@@ -13,6 +13,7 @@ import pytest
 import torch
 from conftest import lit_frame, write_tiny_capture
 from PIL import Image
+from told import Told
 
 from handavatar.avatar import CheckpointError, HandAvatar
 from handavatar.capture.frames import CaptureError, Frame, read_capture, write_capture
@@ -26,6 +27,7 @@ from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import ShapedHand
 from handavatar.jobs.files import FolderInUse
+from handavatar.jobs.progress import Progress
 
 KEYS = {
     "split",
@@ -75,9 +77,9 @@ def judged(
 ) -> tuple[dict[str, Any], Path]:
     out = tmp_path_factory.mktemp("judged") / "out"
     options = EvaluateOptions(avatar_file, tiny_capture, out=out, device="cpu")
-    told: list[float] = []
-    metrics = evaluate_run(options, lambda share, doing: told.append(share))
-    assert told == sorted(told) and len(told) > 1 and told[-1] <= 1
+    told = Told()
+    metrics = evaluate_run(options, told.progress)
+    assert told.shares == sorted(told.shares) and len(told.shares) > 1 and told.shares[-1] <= 1
     return metrics, out
 
 
@@ -189,7 +191,11 @@ def test_tracked_poses_are_fitted_to_masks_and_known_ones_are_not(
     seen: list[list[Frame]] = []
 
     def noted(
-        hands: list[ShapedHand], frames: list[Frame], options: RegisterOptions, learns_shape: bool
+        hands: list[ShapedHand],
+        frames: list[Frame],
+        options: RegisterOptions,
+        learns_shape: bool,
+        progress: Progress,
     ) -> list[HandPose]:
         # By landmarks and masks, never by colours, and with the avatar's own shape.
         assert options.texture_sigmas == () and not learns_shape

@@ -630,7 +630,8 @@ def begin_training(
         num_lights=capture.num_clips,
     )
     load_prior(avatar.occupancy, options.prior)
-    avatar.start_from_color(mean_color((frame.colors, frame.mask) for frame in frames))
+    some = choose_frames(frames, _spread(len(frames), _SEEN_FRAMES))
+    avatar.start_from_color(mean_color((frame.colors, frame.mask) for frame in some))
     wrists = torch.stack([frame.pose.rotations[0] for frame in frames])
     avatar.illumination.wrist_reference.copy_(mean_rotation(wrists))
     avatar.occupancy.encoder.requires_grad_(False)
