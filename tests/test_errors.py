@@ -230,7 +230,9 @@ def _outcome(command: str, words: list[str], monkeypatch: pytest.MonkeyPatch) ->
 
 
 # What is meant to be endless, or is a switch or an id.
-_UNBOUNDED = {"register.energy.contact_error"}
+_UNBOUNDED = {
+    f"register.energy.{name}" for name in ("contact_error", "texture_outlier", "landmark_outlier")
+}
 
 
 def test_every_number_of_every_command_has_a_range(monkeypatch: pytest.MonkeyPatch) -> None:

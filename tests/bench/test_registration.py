@@ -68,7 +68,7 @@ def test_noise_is_told_row_by_row(
     low, high = tracked["interval"]
     assert low < tracked["vertices_mm"] < high
     assert "noise5, registered" in table.markdown()
-    assert steps == [1, 2, 3, 4]
+    assert sorted(set(told.steps)) == [1, 2, 3, 4]
     # What was kept is not measured again.
     monkeypatch.setattr(registration, "register_capture", lambda capture: 1 / 0)
     assert registration_table(options).record() == table.record()

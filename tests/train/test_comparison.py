@@ -11,6 +11,7 @@ import pytest
 import torch
 from told import Told
 
+from handavatar.errors import HandAvatarError
 from handavatar.field.decoders import Decoder, OccupancyField
 from handavatar.field.occupancy import HandCodes
 from handavatar.hand.open_hand import load_open_hand
@@ -180,18 +181,19 @@ def test_a_guide_is_compared_with_the_same_decoder(tmp_path: Path) -> None:
 
 def test_impossible_comparisons_are_refused(tmp_path: Path) -> None:
     options = _options(tmp_path / "none")
-    for wrong, message in (
-        (replace(options, decoders=("coap", "transformer")), "expected 'pair'"),
-        (replace(options, decoders=("pair",)), "at least one other"),
-        (replace(options, seeds=(1, 1)), "expected different ones"),
-        (replace(options, seeds=()), "expected different ones"),
-        (replace(options, poses=1, measured_poses=1), "two or more"),
-        (replace(options, measured_poses=4), "no more measured than judged"),
-        (replace(options, guides=(1, 1)), "different numbers of subdivisions"),
-        (replace(options, guides=(-1,)), "0 or more"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            compare_decoders(wrong)
+    wrong: dict[str, dict[str, Any]] = {
+        "expected 'pair'": {"decoders": ("coap", "transformer")},
+        "at least one other": {"decoders": ("pair",)},
+        r"found \(1, 1\), expected different ones": {"seeds": (1, 1)},
+        r"found \(\), expected different ones": {"seeds": ()},
+        "`poses`: found 1, expected 2 to": {"poses": 1, "measured_poses": 1},
+        "no more measured than judged": {"measured_poses": 4},
+        "different numbers of subdivisions": {"guides": (1, 1)},
+        "`guides`: found -1, expected 0 to": {"guides": (-1,)},
+    }
+    for message, changes in wrong.items():
+        with pytest.raises(HandAvatarError, match=message):
+            compare_decoders(replace(options, **changes))
     assert not (tmp_path / "none").exists()
 
 

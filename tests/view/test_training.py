@@ -398,7 +398,7 @@ def test_options_of_the_page_are_refused_without_it_or_if_they_mean_nothing(
         (["--port", "8000"], "--port: only with --view"),
         (["--token", "x"], "--token: only with --view"),
         (["--view", "--port", "70000"], "--port: found 70000"),
-        (["--view", "--token", "a b"], "--token: expected letters"),
+        (["--view", "--token", "a b"], "expected letters"),
     ):
         assert cli.main([*words, *more]) == 2
         assert why in capsys.readouterr().err

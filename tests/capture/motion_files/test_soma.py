@@ -117,7 +117,8 @@ def as_matrices(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 def convert(arrays: dict[str, Any], folder: Path, *words: str) -> Motion:
     np.savez(folder / "soma.npz", **arrays)
     out = folder / "back.json"
-    assert main(["motion", "from", str(folder / "soma.npz"), "--out", str(out), *words]) == 0
+    command = ["motion", "from", str(folder / "soma.npz"), "--out", str(out), "--overwrite"]
+    assert main([*command, *words]) == 0
     return read_motion(out)
 
 

@@ -60,7 +60,8 @@ def rigs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 def convert(source: Path, *words: str, rig: str) -> Motion:
     out = source.parent / "motion.json"
-    assert main(["motion", "from", str(source), "--out", str(out), "--rig", rig, *words]) == 0
+    command = ["motion", "from", str(source), "--out", str(out), "--overwrite", "--rig", rig]
+    assert main([*command, *words]) == 0
     return read_motion(out)
 
 
