@@ -34,7 +34,13 @@ from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import is_empty, refuse_file_in_use, write_atomically
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
 from handavatar.jobs.progress import SILENT, Progress
-from handavatar.jobs.signals import Interrupted, heard_signals, is_stopping, unbroken
+from handavatar.jobs.signals import (
+    Interrupted,
+    heard_signals,
+    is_stopping,
+    stop_point,
+    unbroken,
+)
 from handavatar.processes import Processes, joined_processes
 from handavatar.train.divergence import divergence_noted, take_seed
 from handavatar.train.labelled_poses import LabelledPose, PoseStream, labelled_pose
@@ -190,6 +196,7 @@ def _trained(
     progress: Progress,
 ) -> OccupancyField:
     """The loop; ``run`` is the first process's alone."""
+    stop_point()  # From here on, processes stop together.
     torch.manual_seed(options.seed)
     field = untrained_field(options.decoder)
     if options.start_from is not None:
