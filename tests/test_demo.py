@@ -32,7 +32,7 @@ def test_the_demonstration_leaves_everything_it_promises(
     )
     monkeypatch.setitem(METHODS, "quick", quick)
     evaluate = demo.evaluate_run
-    monkeypatch.setattr(demo, "evaluate_run", lambda o: evaluate(replace(o, max_frames=1)))
+    monkeypatch.setattr(demo, "evaluate_run", lambda o, p: evaluate(replace(o, max_frames=1), p))
     out = run_demo(DemoOptions(tmp_path / "out", steps=4, frames=2, size=32, device="cpu"))
     names = {path.name for path in out.iterdir()}
     promised = {"avatar.safetensors", "metrics.json", "report.html", "novel_poses.mp4"}

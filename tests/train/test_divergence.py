@@ -378,7 +378,7 @@ INJECTIONS: dict[str, Injection] = {
         _shape_gradient, "outlines: avatar.shape.mlp.* holds NaN", is_whole=True
     ),
     "outlines: loss": Injection(
-        _result(outlines, "silhouette_loss", NAN), "outlines, step 1: silhouette", is_whole=True
+        _result(outlines, "silhouette_loss", NAN), "outlines, piece 1: silhouette", is_whole=True
     ),
     "outlines: shape": Injection(
         _after_stage("fit_outlines", lambda a, *_: _put(a.shape.mlp.output.weight, NAN)),
@@ -421,7 +421,7 @@ INJECTIONS: dict[str, Injection] = {
     "sky: loss": Injection(_sky, "sky of clip 0: brightness", method=TRACED, is_whole=True),
     "sky: directions": Injection(
         _after_stage("place_directions", lambda a, *_: _put(a.illumination.directions, NAN)),
-        "step 1: .*avatar.illumination.directions",
+        "stage done: .*directions holds NaN",
         method=TRACED,
         is_whole=True,
     ),

@@ -178,7 +178,7 @@ def test_ctrl_c_ends_both_and_saves(page: Any, tiny_capture: Path, tmp_path: Pat
         (viewer,) = training.page_processes()
         training.process.send_signal(signal.SIGINT)
         assert training.process.wait(PATIENCE) == 130
-        assert "interrupted: stopped at step" in training.err
+        assert ": stopped at step" in training.err
         assert is_gone(viewer)
         page.wait_for_function("() => problem.textContent.includes('does not answer')")
         assert list((training.run / "checkpoints").glob("step-*"))
