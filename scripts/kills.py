@@ -24,20 +24,16 @@ import sys
 import tempfile
 import time
 from dataclasses import dataclass, field
-from hashlib import sha256
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from conftest import TINY, write_tiny_capture
+from stop_anywhere import contents
 
 from handavatar.cli import main
-from handavatar.jobs.files import MARKER
 from handavatar.train.loop import METHODS, TrainOptions, train
-
-TIMES = {"seconds", "time", "started"}
-"""Entries of JSON files that say when or how fast."""
 
 
 @dataclass(frozen=True)
@@ -87,25 +83,6 @@ def start(words: list[str]) -> int:
         os.dup2(null, 2)
         os._exit(main(words))
     return process
-
-
-def picture_of(place: Path) -> dict[str, str]:
-    """Hashes of a file, or of all files below a folder, without what says when."""
-    files = [place] if place.is_file() else sorted(p for p in place.rglob("*") if p.is_file())
-    return {str(p.relative_to(place)): _hash(p) for p in files if p.name not in (MARKER, ".lock")}
-
-
-def _hash(path: Path) -> str:
-    content = path.read_bytes()
-    if path.suffix == ".json":
-        content = json.dumps(_timeless(json.loads(content)), sort_keys=True).encode()
-    return sha256(content).hexdigest()
-
-
-def _timeless(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _timeless(entry) for key, entry in value.items() if key not in TIMES}
-    return [_timeless(entry) for entry in value] if isinstance(value, list) else value
 
 
 def remove(path: Path) -> None:
@@ -172,14 +149,14 @@ def killed(job: Job, count: int, draw: random.Random) -> Score:
     for path in places:
         remove(path)
     run(job.old)
-    old = [picture_of(path) for path in places]
+    old = [contents(path) for path in places]
     kept = job.place.parent.parent / "kept"
     for path in places:
         copy(path, kept / path.name)
     begin = time.monotonic()
     run(job.new)
     length = time.monotonic() - begin
-    new = [picture_of(path) for path in places]
+    new = [contents(path) for path in places]
     score = Score()
     if old == new:
         score.wrong.append("old and new are the same: nothing was tested")
@@ -194,7 +171,7 @@ def killed(job: Job, count: int, draw: random.Random) -> Score:
         score.kills += os.WIFSIGNALED(status)
         score.ended_before += not os.WIFSIGNALED(status)
         for path, was, becomes in zip(places, old, new, strict=True):
-            found = picture_of(path) if path.exists() else None
+            found = contents(path) if path.exists() else None
             score.old += found == was
             score.new += found == becomes
             if found not in (was, becomes):
@@ -203,7 +180,7 @@ def killed(job: Job, count: int, draw: random.Random) -> Score:
             score.wrong.append(f"kill {number}: a neighbour was touched")
         if number % 5 == 4 or number == count - 1:
             run(job.new)
-            if [picture_of(path) for path in places] != new:
+            if [contents(path) for path in places] != new:
                 score.wrong.append(f"kill {number}: the same command again ends otherwise")
     left = {path.name for path in job.place.parent.iterdir()} - {path.name for path in neighbours}
     left = {name for name in left if not name.startswith(".tmp-")}

@@ -20,6 +20,7 @@ from PIL import Image
 from torch import Tensor
 
 from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chosen_device
+from handavatar.capture.frame_sequence import spread_numbers
 from handavatar.capture.motion import gesture, open_motion
 from handavatar.capture.view import camera_holding, start_of
 from handavatar.edit import Edit
@@ -137,7 +138,7 @@ def render_motion(options: RenderOptions, progress: Progress = SILENT) -> Path:
     edit = options.edit_on(avatar)
     start = start_of(avatar.view(edit))
     motion = open_motion(options.motion, avatar.base_rig.to("cpu"), start)
-    poses = [motion.pose(step) for step in _spread(len(motion), options.frames)]
+    poses = [motion.pose(step) for step in spread_numbers(len(motion), options.frames)]
     camera = camera_on(avatar, poses, options.size, edit=edit)
     views = [camera] * len(poses)
     if options.orbit:
@@ -357,12 +358,6 @@ def pass_pictures(rendering: Rendering, side: str = "right") -> dict[str, np.nda
     if side == "left":
         pictures = {name: np.ascontiguousarray(value[:, ::-1]) for name, value in pictures.items()}
     return pictures
-
-
-def _spread(length: int, count: int | None) -> list[int]:
-    if count is None or count >= length:
-        return list(range(length))
-    return torch.linspace(0, length - 1, count).round().long().tolist()
 
 
 def _middle(avatar: HandAvatar, pose: HandPose) -> Tensor:

@@ -4,6 +4,8 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import overload
 
+import torch
+
 from handavatar.capture.frames import Frame
 
 MOST_KEPT_BYTES = 512 * 2**20
@@ -86,3 +88,15 @@ def choose_frames(frames: Sequence[Frame], numbers: Sequence[int]) -> Sequence[F
         numbers: of those that are wanted.
     """
     return FrameSequence(lambda place: frames[numbers[place]], len(numbers), room=0)
+
+
+def spread_numbers(count: int, most: int | None) -> list[int]:
+    """Numbers of some of a row, evenly spread, the first and the last among them.
+
+    Args:
+        count: of the row.
+        most: that are wanted; all if None or more than there are.
+    """
+    if most is None or most >= count:
+        return list(range(count))
+    return torch.linspace(0, count - 1, most).round().long().tolist()

@@ -14,12 +14,11 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -765,9 +764,12 @@ class CaptureWriter:
 
     def __enter__(self) -> "CaptureWriter":
         """Makes the folder that takes the capture's place when it is whole."""
-        self._filling = fill_folder(self.folder, CAPTURE, self._overwrite, self._inputs)
-        with _folder_errors():
-            self._aside = self._filling.__enter__()
+        with ExitStack() as whole:
+            whole.enter_context(_folder_errors())
+            filled = fill_folder(self.folder, CAPTURE, self._overwrite, self._inputs)
+            self._aside = whole.enter_context(filled)
+            whole.push(self._finish)
+            self._whole = whole.pop_all()
         return self
 
     def file(self, relative: str) -> Path:
@@ -827,23 +829,13 @@ class CaptureWriter:
             }
         )
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: Any) -> None:
         """Puts the whole capture in place, or removes what there is of it."""
-        if kind is None:
-            try:
-                self._finish()
-            except BaseException as failure:
-                self._filling.__exit__(type(failure), failure, failure.__traceback__)
-                raise
-        with _folder_errors():
-            self._filling.__exit__(kind, error, traceback)
+        self._whole.__exit__(*raised)
 
-    def _finish(self) -> None:
+    def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not None:
+            return
         content = {
             "camera_model": "OPENCV",
             "handavatar": self._header,

@@ -130,7 +130,6 @@ def view(words: list[str], progress: Progress) -> int:
     from handavatar.view.server import view as serve
 
     options = parse(ViewOptions, words, "view", ("run",), {"run": SHOWN, "motion": MOTION})
-    with progress:
-        """Nothing more to tell: it serves until it is stopped."""
+    progress.end()  # It serves until it is stopped.
     serve(options)
     return 0

@@ -68,8 +68,7 @@ def webcam(words: list[str], progress: Progress) -> int:
         about=_WEBCAM,
         reads={"drive": AVATAR, "more": VIDEO, "masks": MASKS, "camera": CAMERAS},
     )
-    with progress:
-        """Nothing to tell while the page is open."""
+    progress.end()  # While the page is open there is nothing to tell.
     recording = _record(options, values)
     if recording is None:
         return 0

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar
+from handavatar.capture.frame_sequence import spread_numbers
 from handavatar.capture.frames import FITTED_SIDE, Capture, Frame
 from handavatar.evaluate.metrics import JudgedFrame, exposed, masked_psnr, mean_color
 from handavatar.evaluate.textured_mesh import fit_textured_mesh
@@ -48,8 +48,7 @@ def textured_mesh_psnr(
         Decibels, mean over the frames.
     """
     indices = capture.split("train")
-    count = min(MESH_FRAMES, len(indices))
-    places = torch.linspace(0, len(indices) - 1, count).round().long().tolist()
+    places = spread_numbers(len(indices), MESH_FRAMES)
     # As large as what is judged.
     side = max(frames[0].camera.width, frames[0].camera.height)
     training = [capture.frame(indices[place]).binned(side) for place in places]

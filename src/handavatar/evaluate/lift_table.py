@@ -13,6 +13,7 @@ from torch import Tensor
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.checks import CaptureError, load_json
+from handavatar.capture.frame_sequence import spread_numbers
 from handavatar.capture.frames import Capture, Frame, read_capture
 from handavatar.capture.synthetic import Subject, SynthOptions, lifted_truths, make_subject
 from handavatar.edit import Edit, bones_named
@@ -96,8 +97,7 @@ def lift_table(options: LiftTableOptions, progress: Progress = SILENT) -> Result
     labels = {path: path.name if names.count(path.name) == 1 else str(path) for path in avatars}
     finished = step_counter(progress, options.total_steps)
     test = capture.split("test")
-    places = torch.linspace(0, len(test) - 1, min(options.frames, len(test))).round().long()
-    frames = [capture.frame(test[place]) for place in places.tolist()]
+    frames = [capture.frame(test[place]) for place in spread_numbers(len(test), options.frames)]
     truths: dict[str, list[LiftedFrame]] = {}
     for name, bones in groups.items():
         truths[name] = []

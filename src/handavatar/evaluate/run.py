@@ -13,6 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar, Rendering, chosen_device
+from handavatar.capture.frame_sequence import spread_numbers
 from handavatar.capture.frames import (
     FITTED_SIDE,
     Capture,
@@ -130,7 +131,8 @@ def evaluate_run(options: EvaluateOptions, progress: Progress = SILENT) -> dict[
     """
     avatar, capture, out = _opened(options)
     avatar.moved_to(chosen_device(options.device))
-    indices = _spread(capture.split(options.split), options.max_frames)
+    split = capture.split(options.split)
+    indices = [split[place] for place in spread_numbers(len(split), options.max_frames)]
     if not indices:
         raise CaptureError(
             f"{capture.folder}: no frame of split {options.split!r}",
@@ -251,13 +253,6 @@ def _opened(options: EvaluateOptions) -> tuple[HandAvatar, Capture, Path]:
         avatar = HandAvatar.load(run)
         out = options.out or run.parent / f"{run.stem}-evaluation"
     return avatar, read_capture(folder), out
-
-
-def _spread(indices: tuple[int, ...], count: int | None) -> list[int]:
-    if count is None or count >= len(indices):
-        return list(indices)
-    places = torch.linspace(0, len(indices) - 1, count).round().long().tolist()
-    return [indices[place] for place in places]
 
 
 def _on_cpu(rendering: Rendering) -> Rendering:

@@ -251,10 +251,7 @@ def _register(
 
     def draw_to_texture(sigma: float) -> None:
         nonlocal look
-        descent.forget_bands(_FINE)
-        for other in options.texture_sigmas:
-            if other != sigma:
-                descent.forget_bands(other * width)
+        descent.forget_other_bands(sigma * width)
         look = textured_look(descent, sigma * width)
         descent.step_poses(look, 2)
 

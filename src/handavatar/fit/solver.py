@@ -118,9 +118,9 @@ class Descent:
             self._bands[key] = band
         return band
 
-    def forget_bands(self, sigma: float) -> None:
-        """Frees what belongs to one blur."""
-        self._bands = {key: value for key, value in self._bands.items() if key[1] != sigma}
+    def forget_other_bands(self, sigma: float) -> None:
+        """Frees what belongs to other blurs."""
+        self._bands = {key: value for key, value in self._bands.items() if key[1] == sigma}
 
     def see(self, look: Look) -> list[SeenTexture]:
         """The texture that every frame shows, with the poses as they are."""

@@ -28,6 +28,7 @@ from typing import Any
 
 from handavatar import __version__
 from handavatar.errors import ErrorKind, HandAvatarError
+from handavatar.jobs.processes import is_running
 
 MARKER = ".handavatar"
 """Name of the file that says that, and how, the program made a folder."""
@@ -387,9 +388,7 @@ def swap_folder(
     target = _absolute(target)
     refuse_folder_in_use(target, kind, overwrite, inputs)
     if is_empty(target):
-        _sync_tree(whole)
-        os.rename(whole, target)
-        _sync(target.parent)
+        put_in_place(whole, target)
         return
     if read_marker(target) is None:
         mark_folder(target, kind)
@@ -422,7 +421,7 @@ def put_in_place(whole: Path, target: Path) -> None:
         OSError: if it cannot be; then all is as it was.
     """
     _sync_tree(whole)
-    if not target.exists():
+    if is_empty(target):
         os.rename(whole, target)
     elif not _exchange(whole, target):
         old = _free_number(whole.with_name(f"{whole.name}-old"))
@@ -594,21 +593,8 @@ def _remove_abandoned(target: Path, kind: FolderKind) -> None:
             marker = read_marker(path) or {}
             is_ours = marker.get("kind") == kind.name and marker.get("host") == socket.gethostname()
             process = marker.get("process")
-            if is_ours and isinstance(process, int) and not _is_running(process):
+            if is_ours and isinstance(process, int) and not is_running(process):
                 remove_folder(path)  # One killed before it could mark its folder leaves it empty.
-
-
-def _is_running(process: int) -> bool:
-    """Whether a process of this machine is there; where nobody can tell, it is."""
-    if os.name == "nt" or process <= 0:
-        return True
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
 
 
 # --- folders that fill slowly ---------------------------------------------------------------------

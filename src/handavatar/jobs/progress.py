@@ -79,9 +79,17 @@ class Progress:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Leaves the last state standing; from then on, results can be printed."""
+        """As :meth:`end`."""
+        self.end(is_whole=error is None)
+
+    def end(self, is_whole: bool = True) -> None:
+        """Leaves the last state standing; from then on, results can be printed.
+
+        Args:
+            is_whole: whether all is done.
+        """
         if self._board is not None:
-            self._board.end(is_whole=error is None)
+            self._board.end(is_whole)
 
     def __call__(
         self, done: Number, total: Number = 1.0, note: str = "", /, **figures: float

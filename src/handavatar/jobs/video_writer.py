@@ -4,7 +4,6 @@ import contextlib
 import platform
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import av
@@ -42,38 +41,37 @@ class VideoWriter:
             width: of a picture that is no square, which then is ``size`` high.
             crf: constant rate factor: smaller is nearer to the pictures.
         """
-        self._whole = contextlib.ExitStack()
         self._height, self._width = size // 2 * 2, (width or size) // 2 * 2
-        self._container = av.open(str(self._whole.enter_context(write_aside(path))), "w")
+        with contextlib.ExitStack() as whole:
+            self._container = av.open(str(whole.enter_context(write_aside(path))), "w")
+            whole.push(self._finish)
+            self._stream = self._open_stream(fps, crf)
+            self._whole = whole.pop_all()
+
+    def _open_stream(self, fps: float, crf: int) -> Any:
         rate = Fraction(fps).limit_denominator(1000)
-        self._stream: Any = self._container.add_stream("libx264", rate=rate)
-        self._stream.width, self._stream.height = self._width, self._height
-        self._stream.pix_fmt = "yuv420p"
+        stream: Any = self._container.add_stream("libx264", rate=rate)
+        stream.width, stream.height = self._width, self._height
+        stream.pix_fmt = "yuv420p"
         # One thread: with several, who comes first decides about bits.
-        self._stream.options = {"crf": str(crf), "threads": "1"} | _SAME_EVERYWHERE
-        context = self._stream.codec_context
+        stream.options = {"crf": str(crf), "threads": "1"} | _SAME_EVERYWHERE
+        context = stream.codec_context
         context.color_primaries = context.color_trc = context.colorspace = _BT709
         context.color_range = ColorRange.MPEG
+        return stream
 
     def __enter__(self) -> "VideoWriter":
         """Itself."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: Any) -> None:
         """Puts the whole film in place; if the block failed, nothing of it stays."""
-        try:
-            if error is None:
-                self._container.mux(self._stream.encode())
-            self._container.close()
-        except BaseException as failure:
-            self._whole.__exit__(type(failure), failure, failure.__traceback__)
-            raise
-        self._whole.__exit__(kind, error, traceback)
+        self._whole.__exit__(*raised)
+
+    def _finish(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self._container.mux(self._stream.encode())
+        self._container.close()
 
     def add(self, pixels: UInt8[np.ndarray, "height width 3"]) -> None:
         """Adds one picture, sRGB."""

@@ -28,6 +28,7 @@ from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
 from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import NotFinite
+from handavatar.jobs.processes import is_running
 from handavatar.jobs.progress import Progress
 from handavatar.train.corrections import PoseCorrections
 from handavatar.train.runs import Run
@@ -79,13 +80,7 @@ class LiveState:
         """Whether a trainer works on the run now; of another machine's, whether it said so last."""
         if self.phase != "training" or self.host != socket.gethostname():
             return self.phase == "training"
-        try:
-            os.kill(self.process, 0)
-        except ProcessLookupError:
-            return False
-        except PermissionError:
-            return True  # Another user's.
-        return True
+        return is_running(self.process)
 
 
 def live_folder(run: Run) -> Path:

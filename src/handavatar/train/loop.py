@@ -15,7 +15,12 @@ from torch import Tensor
 
 from handavatar import __version__
 from handavatar.avatar import SCHEMA, CheckpointError, HandAvatar, RenderSettings, chosen_device
-from handavatar.capture.frame_sequence import FrameSequence, change_frames, choose_frames
+from handavatar.capture.frame_sequence import (
+    FrameSequence,
+    change_frames,
+    choose_frames,
+    spread_numbers,
+)
 from handavatar.capture.frames import FITTED_SIDE, Capture, CaptureError, Frame, read_capture
 from handavatar.capture.soundness import require_sound
 from handavatar.capture.view import view_of
@@ -324,9 +329,9 @@ def _train(options: TrainOptions, progress: Progress) -> Path:
     method = METHODS[options.method]
     steps = method.steps if options.steps is None else options.steps
     capture = read_capture(options.capture)
-    stages = progress.stages(
-        stage_seconds(method, steps, len(capture.split("train")), capture.is_tracked)
-    )
+    is_corrected = capture.is_tracked and method.corrects_poses
+    seconds = stage_seconds(method, steps, len(capture.split("train")), is_corrected)
+    stages = progress.stages(seconds)
     require_sound(capture, stages["checks"])
     frames = training_frames(capture, method, stages["frames"])
     perceptual = perceptual_loss(options.perceptual).to(device)
@@ -344,9 +349,7 @@ def _train(options: TrainOptions, progress: Progress) -> Path:
     noted = divergence_noted(run, begun, options.seed, words)
     where = "before the first step"
     with locked(run), live as progress, _repeatable(device), noted:
-        stages = progress.stages(
-            stage_seconds(method, steps, len(frames), training.corrections is not None)
-        )
+        stages = progress.stages(seconds)
         checkpoint = latest_checkpoint(run)
         take_seed(run, begun, options.seed, checkpoint.step if checkpoint else 0)
         work = _fingerprint(capture, method, options)
@@ -540,7 +543,7 @@ def _learn_detail(
         seen = find_seen_samples(avatar, small, settings, stride, parts["samples"])
     corrected = corrected_frames(training, _detailed_frames(capture, frames))
     if len(frames) > _MOST_DETAIL_FRAMES:
-        numbers = _spread(len(frames), _MOST_DETAIL_FRAMES)
+        numbers = spread_numbers(len(frames), _MOST_DETAIL_FRAMES)
         seen, corrected = samples_of_frames(seen, numbers), choose_frames(corrected, numbers)
     learned = learn_detail(
         avatar,
@@ -562,11 +565,6 @@ def _learn_detail(
     }
 
 
-def _spread(count: int, most: int) -> list[int]:
-    """Numbers of as many frames as may be, evenly spread."""
-    return torch.linspace(0, count - 1, min(count, most)).round().long().tolist()
-
-
 def _thinning(num_frames: int) -> int:
     """By how much pixels lie further apart, so that those of very many frames are not more."""
     return math.ceil(math.sqrt(max(1.0, num_frames / _SEEN_FRAMES)))
@@ -580,7 +578,7 @@ def _detailed_frames(capture: Capture, frames: Sequence[Frame]) -> Sequence[Fram
         frames: as large as training takes them.
     """
     indices = capture.split("train")
-    whole = set(_spread(len(frames), _DETAILED_FRAMES))
+    whole = set(spread_numbers(len(frames), _DETAILED_FRAMES))
 
     def detailed(number: int, frame: Frame) -> Frame:
         is_large = number in whole and capture.records[indices[number]].camera != frame.camera
@@ -630,7 +628,7 @@ def begin_training(
         num_lights=capture.num_clips,
     )
     load_prior(avatar.occupancy, options.prior)
-    some = choose_frames(frames, _spread(len(frames), _SEEN_FRAMES))
+    some = choose_frames(frames, spread_numbers(len(frames), _SEEN_FRAMES))
     avatar.start_from_color(mean_color((frame.colors, frame.mask) for frame in some))
     wrists = torch.stack([frame.pose.rotations[0] for frame in frames])
     avatar.illumination.wrist_reference.copy_(mean_rotation(wrists))
