@@ -119,7 +119,7 @@ def lift_table(options: LiftTableOptions, progress: Progress = SILENT) -> Result
         f"{name}: {label}": rows[f"{name}: {label}"] for name in groups for label in labels.values()
     }
     notes = (
-        f"{options.capture.name}, {len(places)} test frames; PSNR over the pixels that the shadow "
+        f"{options.capture.name}, {len(frames)} test frames; PSNR over the pixels that the shadow "
         f"darkens or brightens by more than {CHANGED * 255:.0f}/255 in truth (frames with fewer "
         f"than {_FEWEST} are left out). Left as it is: the unedited picture against the same truth."
         " Best possible: the avatar's error where nothing is lifted, on the same pixels.",
