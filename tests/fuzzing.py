@@ -1,18 +1,25 @@
 """Mutants of files: bytes, JSON values and tensors, changed at random, always in the same way."""
 
 import copy
+import io
 import json
+import pickle
 import random
+import resource
 import signal
 import struct
 import traceback
+import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from handavatar.cli.failures import OUR_BUG, explanation, printable
+import numpy as np
+
+from handavatar.cli.failures import OUR_BUG, OUT_OF_SPACE, explanation
+from handavatar.errors import printable
 
 HOSTILE: list[Any] = [
     *(None, True, False, 0, -1, 1, 2, 7, 0.5, -0.0, 1e-300, 1e308, 2**31, 2**63, 10**30, 10**400),
@@ -20,8 +27,10 @@ HOSTILE: list[Any] = [
     *([], {}, [[]], [None], [1, 2, 3], [[1, 2, 3]] * 16, {"a": 1}, {"": None}),
     *(float("nan"), float("inf"), -float("inf")),
 ]
-_SECONDS = 20
+MOST_SECONDS = 20
 """A reader that takes longer hangs."""
+_MOST_MEMORY = 2 * 2**30
+"""Bytes beyond what the process takes anyway."""
 
 
 def changed_bytes(data: bytes, chance: random.Random) -> bytes:
@@ -148,6 +157,106 @@ def changed_tensors(data: bytes, chance: random.Random) -> bytes:
     return struct.pack("<Q", len(text)) + text + bytes(body)
 
 
+def changed_text(data: bytes, chance: random.Random) -> bytes:
+    """Lines of words in which some are others, or bytes changed at random."""
+    if chance.random() < 0.3:
+        return changed_bytes(data, chance)
+    lines = [line.split(" ") for line in data.decode().split("\n")]
+    for _ in range(chance.choice((1, 1, 2, 3))):
+        words = chance.choice(lines)
+        place = chance.randrange(len(words))
+        match chance.randrange(4):
+            case 0 | 1:
+                words[place] = str(chance.choice(HOSTILE))
+            case 2:
+                words[place : place + 1] = words * chance.randrange(3)
+            case 3:
+                lines.insert(chance.randrange(len(lines)), words)
+    return "\n".join(map(" ".join, lines)).encode("utf-8", "surrogatepass")
+
+
+def limit_memory() -> None:
+    """So that a reader that takes all there is takes it from itself alone."""
+    most = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (most + 4 * _MOST_MEMORY,) * 2)
+
+
+@contextmanager
+def _measured(told: list[str]) -> Iterator[None]:
+    """Tells whether much more memory was taken than before, which is looked at once and again."""
+    before = _resident("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")  # The peak is that of now.
+    try:
+        yield
+    finally:
+        taken = _resident("VmHWM") - before
+        if taken > _MOST_MEMORY:
+            told.append(f"takes {taken / 2**30:.1f} GiB")
+
+
+def _resident(name: str) -> int:
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(status.split(f"{name}:")[1].split()[0])
+
+
+def changed_arrays(data: bytes, chance: random.Random) -> bytes:
+    """An npz file whose arrays are others, or called otherwise, or whose bytes are changed."""
+    if chance.random() < 0.1:
+        return changed_bytes(data, chance)
+    arrays = dict(np.load(io.BytesIO(data)))
+    if chance.random() < 0.2:  # The bytes of one array, header and all, in a sound archive.
+        name = chance.choice(list(arrays))
+        written = io.BytesIO()
+        np.save(written, arrays[name])
+        archive = io.BytesIO()
+        with zipfile.ZipFile(archive, "w") as members:
+            members.writestr(f"{name}.npy", changed_bytes(written.getvalue(), chance))
+            for other in set(arrays) - {name}:
+                written = io.BytesIO()
+                np.save(written, arrays[other])
+                members.writestr(f"{other}.npy", written.getvalue())
+        return archive.getvalue()
+    written = io.BytesIO()
+    np.savez(written, **_changed_fields(arrays, chance))
+    return written.getvalue()
+
+
+def changed_pickle(data: bytes, chance: random.Random) -> bytes:
+    """A pickled dictionary of arrays that holds others, or whose bytes are changed."""
+    if chance.random() < 0.6:
+        return changed_bytes(data, chance)
+    return pickle.dumps(_changed_fields(pickle.loads(data), chance), 4)
+
+
+def _changed_fields(fields: dict[str, Any], chance: random.Random) -> dict[str, Any]:
+    fields = dict(fields)
+    for _ in range(chance.choice((1, 1, 1, 2, 3))):
+        if not fields:
+            break
+        name = chance.choice(list(fields))
+        array = np.array(fields[name])
+        match chance.randrange(8):
+            case 0:
+                del fields[name]
+            case 1:
+                fields[chance.choice([name + "x", "\x1b[31m", *fields])] = fields.pop(name)
+            case 2:
+                fields[name] = array.reshape(chance.choice([(-1,), (1, *array.shape)]))
+            case 3:
+                fields[name] = array[..., : chance.randrange(4)] if array.ndim else array[None]
+            case 4:
+                kinds = ("float16", "int8", "uint64", "bool", "complex64", "S4", "U4", "M8[s]")
+                fields[name] = np.zeros(array.shape, chance.choice(kinds))
+            case 5 | 6:
+                array = array.copy() if array.dtype.kind == "f" else np.zeros(array.shape)
+                numbers = (float("nan"), float("inf"), 1e308, -1e300, 1e-300, 1e18, 7.0, -1.0, 0.5)
+                array.reshape(-1)[: chance.choice((1, 3, array.size))] = chance.choice(numbers)
+                fields[name] = array
+            case 7:
+                fields[name] = np.repeat(array[None], chance.choice((2, 300)), 0)
+    return fields
+
+
 class Hangs(Exception):
     """A reader took too long."""
 
@@ -158,7 +267,7 @@ def _limited() -> Iterator[None]:
         raise Hangs
 
     before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(_SECONDS)
+    signal.alarm(MOST_SECONDS)
     try:
         yield
     finally:
@@ -172,11 +281,12 @@ def _is_own(file: str) -> bool:
 
 def fault_of(read: Callable[[], Any]) -> str:
     """How a reader failed on a mutant; empty if it read or refused it as it should."""
+    heavy: list[str] = []
     try:
-        with _limited():
+        with _measured(heavy), _limited():
             read()
     except Hangs:
-        return f"hangs for {_SECONDS} s"
+        return f"hangs for {MOST_SECONDS} s"
     except Exception as error:
         code, message = explanation(error)
         if code == OUR_BUG:
@@ -186,4 +296,6 @@ def fault_of(read: Callable[[], Any]) -> str:
         shown = printable(message)
         if any(ord(sign) < 32 and sign != "\n" for sign in shown):
             return f"an escape sequence in {shown!r}"
-    return ""
+        if code == OUT_OF_SPACE:
+            return f"{message[:150]!r}"
+    return heavy[0] if heavy else ""

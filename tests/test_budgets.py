@@ -25,6 +25,7 @@ from handavatar.capture.checks import (
 from handavatar.capture.frames import read_capture
 from handavatar.capture.motion import read_motion
 from handavatar.capture.soundness import find_problems
+from handavatar.capture.video_cameras import read_camera
 from handavatar.hand.detail import subdivided
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.rig import RigError
@@ -115,6 +116,22 @@ def test_frames_and_steps_are_counted(tmp_path: Path) -> None:
     motion = {"schema": 1, "fps": 30, "rotations": [5] * 100_001, "translations": []}
     (tmp_path / "m.json").write_text(json.dumps(motion))
     _refused_soon(lambda: read_motion(tmp_path / "m.json"), CaptureError, "100001 steps")
+
+
+def test_what_all_frames_have_in_common_may_be_much(tmp_path: Path) -> None:
+    """It was copied for each of the frames."""
+    folder = write_tiny_capture(tmp_path / "capture", "ab", size=24)
+    content = json.loads((folder / "transforms.json").read_text())
+    much = {f"key{number}": 0 for number in range(300_000)}
+    entry = content["frames"][0] | {"mask_path": "masks/none.png"}
+    (folder / "transforms.json").write_text(json.dumps(much | content | {"frames": [entry] * 2000}))
+    _refused_soon(lambda: read_capture(folder), CaptureError, "masks/none.png")
+    entry = {"w": 24, "h": 24, "fl_x": 30.0, "k3": 1.0}
+    frames = [entry | {"k3": 0.0}] * 2000 + [entry]
+    (folder / "transforms.json").write_text(json.dumps(much | {"frames": frames}))
+    _refused_soon(lambda: read_camera(folder), CaptureError, "k3 is not zero")
+    (folder / "transforms.json").write_text(json.dumps({"frames": [entry] * 100_001}))
+    _refused_soon(lambda: read_camera(folder), CaptureError, "100001 frames")
 
 
 def test_pixels_of_all_pictures_together_are_counted(tmp_path: Path) -> None:

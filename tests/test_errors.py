@@ -14,13 +14,14 @@ from source_tree import modules
 from handavatar import cli
 from handavatar.capture.checks import CaptureError
 from handavatar.cli import arguments, bench
-from handavatar.cli.failures import printable, shown, with_flags
+from handavatar.cli.failures import shown, with_flags
 from handavatar.errors import (
     ARGUMENT_MARK,
     ArgumentError,
     ErrorKind,
     HandAvatarError,
     argument,
+    printable,
 )
 from handavatar.hand.rig import LicensedRigMissing
 from handavatar.jobs.files import FolderInUse

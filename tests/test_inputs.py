@@ -20,8 +20,8 @@ from handavatar import cli
 from handavatar.avatar import HandAvatar
 from handavatar.capture.motion import MOTIONS, Motion, write_motion
 from handavatar.cli import arguments
-from handavatar.cli.failures import printable
 from handavatar.cli.inputs import AVATAR, CAPTURE, KINDS, Expected, kind_of, require
+from handavatar.errors import printable
 from handavatar.train.prior import SHIPPED_PRIOR
 from handavatar.train.runs import create_run
 

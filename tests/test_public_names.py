@@ -32,7 +32,7 @@ EXACTLY = {
     "hand.detail": "refined subdivided",
     "errors": (
         "ARGUMENT_MARK ArgumentError ErrorKind HandAvatarError OutOfSpace PlaceRefused SEEDS "
-        "argument machine_error raise_if_refused require_range require_ranges"
+        "argument machine_error printable raise_if_refused require_range require_ranges"
     ),
     "edit": "Edit Paint bones_named",
     "avatar": (

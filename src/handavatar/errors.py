@@ -126,6 +126,23 @@ def argument(name: str, value: object = None) -> str:
     return f"`{name}`" if value is None else f"`{name}={shown!r}`"
 
 
+def printable(text: str) -> str:
+    """A text that may hold anything, so that a terminal shows it and obeys nothing in it.
+
+    What controls a terminal or turns the direction of writing is written as its code, and so is
+    what is no character at all. Line breaks stay.
+
+    Args:
+        text: with parts that come from a file or a file's name.
+    """
+    return "".join(
+        sign
+        if sign == "\n" or sign.isprintable()
+        else sign.encode("unicode_escape").decode("ascii")
+        for sign in text
+    )
+
+
 _VAST = 10**6
 SEEDS = (0, 2**32 - 1)
 """What all generators here take as a seed."""

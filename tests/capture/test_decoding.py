@@ -1,14 +1,18 @@
 """What is read from a video file, and what is refused."""
 
+import random
 import struct
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
+import av
 import numpy as np
 import pytest
 from videos import grey_levels, save_sound, save_video
 
 from handavatar.capture.checks import CaptureError
-from handavatar.capture.decoding import Sampling, video_frames
+from handavatar.capture.decoding import Sampling, _Decoder, video_frames
 
 
 def test_every_third_picture_of_thirty_per_second(tmp_path: Path) -> None:
@@ -30,6 +34,51 @@ def test_common_containers_open(tmp_path: Path, name: str) -> None:
 def test_stops_at_the_greatest_number_of_pictures(tmp_path: Path) -> None:
     path = save_video(tmp_path / "a.mp4", grey_levels(20))
     assert len(list(video_frames(path, Sampling(30.0, max_frames=4)))) == 4
+
+
+def test_times_that_jump_are_no_endless_film(tmp_path: Path) -> None:
+    """Every moment between two frames was looked at: here 30,000 years of them."""
+    path = tmp_path / "a.mkv"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg4", rate=30)
+        stream.width, stream.height = 160, 120
+        for number, image in enumerate(grey_levels(4)):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame.pts = number
+            for packet in stream.encode(frame):
+                if number == 3:
+                    packet.pts = packet.dts = 10**12 * 30
+                container.mux(packet)
+    begin = time.process_time()
+    frames = list(video_frames(path, Sampling(fps=30.0)))
+    assert [frame.index for frame in frames] == [0, 1, 2, 3] and frames[3].time > 1e11
+    assert time.process_time() - begin < 5.0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_frames_nearest_to_the_wanted_times_are_taken(
+    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if every wanted time were looked at by itself."""
+    chance = random.Random(seed)
+    times = sorted(chance.choice((0.1, 1.0)) * chance.randrange(40) / 10 for _ in range(12))
+    times = [time - times[0] for time in times]
+    end = chance.choice((None, 2.0))
+    sampling = Sampling(chance.choice((0.7, 3.0, 30.0)), start=chance.choice((0.0, 0.5)), end=end)
+    wanted, number = [], 0
+    while (at := sampling.wanted(number)) <= times[-1] + 1e-6 and not sampling.is_over(at):
+        after = next(place for place, time in enumerate(times) if time >= at - 1e-6)
+        before = max(after - 1, 0)
+        is_nearer = at - times[before] <= times[after] - at + 1e-6
+        wanted.append(before if is_nearer else after)
+        number += 1
+    decoder = _Decoder(tmp_path, None, SimpleNamespace(average_rate=30), None, sampling, print)
+    decoded = [(place, time, None) for place, time in enumerate(times)]
+    monkeypatch.setattr(decoder, "decoded", lambda: iter(decoded))
+    found = [index for index, _, _ in decoder.wanted()]
+    expected = [index for index in dict.fromkeys(wanted) if not sampling.is_over(times[index])]
+    # The last frame is taken besides if the next time is less than half a frame away.
+    assert found in (expected, [*expected, len(times) - 1])
 
 
 def test_large_pictures_are_brought_down(tmp_path: Path) -> None:

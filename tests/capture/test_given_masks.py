@@ -11,7 +11,7 @@ from videos import save_video
 
 from handavatar.capture.checks import CaptureError
 from handavatar.capture.decoding import Sampling
-from handavatar.capture.given_masks import give_masks
+from handavatar.capture.given_masks import give_masks, read_mask
 from handavatar.capture.left_out import NO_MASK
 from handavatar.capture.masks import HandMask
 from handavatar.capture.tracking import Track
@@ -150,3 +150,13 @@ def test_masks_that_are_wrong_are_refused(tmp_path: Path) -> None:
     picture.save(folder / "0000.png")
     with pytest.raises(CaptureError, match="labels 1, 2, 3: several objects"):
         _given(folder)
+
+
+@pytest.mark.parametrize("mode", ["L", "P", "LA", "RGBA"])
+def test_a_damaged_mask_is_refused_by_name(tmp_path: Path, mode: str) -> None:
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64), dtype=np.uint8)
+    file = tmp_path / "0.png"
+    Image.fromarray(noise).convert(mode).save(file)
+    file.write_bytes(file.read_bytes()[:1500])
+    with pytest.raises(CaptureError, match=r"0\.png is damaged"):
+        read_mask(file)

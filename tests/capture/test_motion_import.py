@@ -56,6 +56,12 @@ def test_frames_without_times_are_refused() -> None:
         motion_of_capture(_capture([0.0, 0.0], [0.0, 1.0]), None, lambda _: None)
 
 
+def test_times_that_are_too_far_apart_are_refused() -> None:
+    for times in ([0.0, 1e308], [-1e308, 1e308], [0.0, 1e-3, 1e9], [0.0, 1e5]):
+        with pytest.raises(CaptureError, match="a second"):
+            motion_of_capture(_capture(times, [0.1] * len(times)), None, lambda _: None)
+
+
 def test_the_command_writes_a_motion_that_is_read_back(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

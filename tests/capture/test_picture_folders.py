@@ -118,3 +118,32 @@ def test_what_is_not_there_or_damaged_is_refused_by_name(tmp_path: Path) -> None
     picture(5, (64, 48)).save(whole / "1.png")
     with pytest.raises(CaptureError, match="64 x 48 pixels"):
         read(whole)
+
+
+@pytest.mark.parametrize("kind", ["tif", "deep"])
+def test_turned_pictures_of_other_kinds_are_upright(tmp_path: Path, kind: str) -> None:
+    """Pillow turns TIFF itself; sixteen bits a pixel lose what says that they are turned."""
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    if kind == "tif":
+        upright = np.asarray(picture(90))
+        picture(90).transpose(Image.Transpose.ROTATE_90).save(tmp_path / "a.tif", exif=exif)
+    else:
+        ramp = np.arange(160, dtype=np.uint16).repeat(120).reshape(160, 120).T
+        upright = ramp[..., None].repeat(3, 2)
+        stored = np.ascontiguousarray(np.rot90(257 * ramp))
+        Image.fromarray(stored).save(tmp_path / "a.png", exif=exif)
+    (frame,), _ = read(tmp_path)
+    assert np.array_equal(frame.image, upright)
+
+
+def test_what_exif_says_in_a_damaged_way_is_not_obeyed(tmp_path: Path) -> None:
+    picture(90).save(tmp_path / "a.png", exif=b"Exif\0\0MM\0*\0\0\0\x08\xff\xff\x01")
+    (frame,), _ = read(tmp_path)
+    assert np.array_equal(frame.image, np.asarray(picture(90)))
+
+
+def test_names_may_hold_digits_that_are_no_numbers(tmp_path: Path) -> None:
+    for number, name in enumerate(("10", "\u00b21", "2")):
+        picture(40 * number).save(tmp_path / f"{name}.png")
+    assert levels(read(tmp_path)[0]) == [40, 80, 0]

@@ -1,6 +1,7 @@
 """A known camera: its lens, its way, and how long its unit is."""
 
 import json
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,29 @@ def _colmap(folder: Path, views: torch.Tensor, camera: str = "") -> Path:
         lines += [" ".join(map(str, words)), "" if number % 2 else "1.5 2.5 -1 3.5 4.5 7"]
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
     return folder
+
+
+def test_the_points_of_colmap_s_pictures_take_no_memory(tmp_path: Path) -> None:
+    """Each of their words was an object of its own."""
+    folder = _colmap(tmp_path / "model", _views(2))
+    lines = (folder / "images.txt").read_text().splitlines()
+    lines[2] = "1 2 -1 " * 500_000
+    (folder / "images.txt").write_text("\n".join(lines))
+    tracemalloc.start()
+    try:
+        camera = read_camera(folder)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(camera.camera_from_world) == 2
+    assert peak < 40e6  # A line has 3.5 million letters.
+
+
+def test_the_names_of_colmap_s_pictures_may_hold_blanks(tmp_path: Path) -> None:
+    folder = _colmap(tmp_path / "model", _views(2))
+    text = (folder / "images.txt").read_text().replace("frame_00001", "my frame  1")
+    (folder / "images.txt").write_text(text)
+    assert list(read_camera(folder).camera_from_world) == ["frame_00000.png", "my frame  1.png"]
 
 
 @pytest.mark.parametrize("write", [_nerfstudio, _colmap])

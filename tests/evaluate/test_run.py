@@ -353,10 +353,27 @@ def test_a_run_folder_names_its_capture_and_shows_its_curves(
     (run / "run.json").write_text(json.dumps({"capture": {"path": str(tiny_capture)}}))
     record = {"psnr": 12.5, "color": 0.1, "silhouette": 0.2}
     lines = [json.dumps({"step": step, **record}) for step in range(1, 41)]
-    (run / "log.jsonl").write_text("\n".join(lines) + '\n{"step": 41, "ps')
+    damaged = [
+        "5",
+        '{"psnr": 1}',
+        '{"step": "x", "psnr": 1}',
+        '{"step": 41, "psnr": "x"}',
+        "[" * 9999,
+    ]
+    (run / "log.jsonl").write_text("\n".join(lines + damaged) + '\n{"step": 41, "ps')
     evaluate_run(EvaluateOptions(run, max_frames=1, device="cpu"))
     report = (run / "evaluation" / "report.html").read_text()
     assert "psnr, mean of 20 steps" in report
+
+
+@pytest.mark.parametrize("facts", ["", "[]", "{}", '{"capture": 5}', '{"capture": {"path": 1}}'])
+def test_a_run_that_does_not_say_its_capture_is_refused(
+    facts: str, avatar_file: Path, tmp_path: Path
+) -> None:
+    shutil.copyfile(avatar_file, tmp_path / "avatar.safetensors")
+    (tmp_path / "run.json").write_text(facts)
+    with pytest.raises(CaptureError, match=r"run\.json"):
+        evaluate_run(EvaluateOptions(tmp_path))
 
 
 def test_large_pictures_are_judged_binned_unless_asked_for_whole(

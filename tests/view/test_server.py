@@ -110,8 +110,9 @@ def test_motions_and_their_poses(server: ViewServer) -> None:
     assert json.loads(ask(server, "/motion?name=wave")[1]) == {"fps": 10.0, "steps": 5}
     angles = json.loads(ask(server, "/angles?motion=wave&step=4")[1])["angles"]
     assert angles[1] != angles[13] == [0, 0, 0]
-    for path in ("/motion?name=none", "/angles?motion=wave&step=5", "/angles?motion=wave&step=x"):
-        assert ask(server, path)[0] == 400
+    for step in ("5", "x", "0000000x", "9" * 5000):
+        assert ask(server, f"/angles?motion=wave&step={step}")[0] == 400
+    assert ask(server, "/motion?name=none")[0] == 400
     assert picture(server, "m", 1, moment={"motion": "wave", "step": 9}) == 400
 
 

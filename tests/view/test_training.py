@@ -249,6 +249,17 @@ def test_losses_are_those_of_the_log_and_of_what_was_told(trainer: Trainer) -> N
     assert len(trainer.watch.curves()["jobs"]["train"]["loss"]) == 3
 
 
+def test_lines_of_a_log_that_are_damaged_are_passed_over(trainer: Trainer) -> None:
+    trainer.step(1, loss=1.0)
+    lines = (b"5", b"[]", b"{}", b"[" * 100_000, b'{"step": "2", "loss": 2}', b"\xff")
+    lines += (b'{"step": -1, "loss": 2}', b'{"step": 2, "loss": "x", "color": 1e999}')
+    lines += (b'{"step": 2, "loss": 1' + b"0" * 400 + b"}",)
+    with open(trainer.run.log, "ab") as file:
+        file.write(b"\n".join(lines) + b"\n")
+    trainer.step(3, loss=3.0)
+    assert trainer.watch.curves()["jobs"]["train"] == {"loss": [[1.0, 1.0], [3.0, 3.0]]}
+
+
 def test_a_long_curve_is_thinned_by_means() -> None:
     curve = _Curve()
     for step in range(1, 5001):

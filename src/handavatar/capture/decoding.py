@@ -96,6 +96,14 @@ class Sampling:
         """The time of which the nearest frame is taken, seconds."""
         return self.start + number / self.fps
 
+    def number_until(self, time: float) -> int:
+        """The last number that is wanted until a time, and until the end; negative if none is."""
+        until = (time if self.end is None else min(time, self.end)) + 1e-6
+        number = math.floor((until - self.start) * self.fps)
+        if self.wanted(number + 1) <= until:
+            return number + 1
+        return number if self.wanted(number) <= until else number - 1
+
     def is_over(self, time: float) -> bool:
         """Whether a time is behind the end."""
         return self.end is not None and time > self.end + 1e-6
@@ -373,16 +381,19 @@ class _Decoder:
         before: tuple[int, float, Any] | None = None
         taken = -1
         for index, time, frame in self.decoded():
-            # A frame that is over may still be the nearest to the last time that is not.
-            while (at := self.sampling.wanted(number)) <= time + 1e-6:
-                if self.sampling.is_over(at):
-                    return
+            last = self.sampling.number_until(time)
+            # A frame that is over may still be the nearest to the last time that is not. Of all
+            # times since the frame before, the first is the nearest to that one, and the last to
+            # this one: there are millions between them where a damaged file's times jump.
+            for at in map(self.sampling.wanted, sorted({number, last} if number <= last else ())):
                 is_nearer = before is not None and at - before[1] <= time - at + 1e-6
                 nearest = before if before is not None and is_nearer else (index, time, frame)
                 if nearest[0] > taken and not self.sampling.is_over(nearest[1]):
                     taken = nearest[0]
                     yield nearest
-                number += 1
+            number = max(number, last + 1)
+            if self.sampling.wanted(number) <= time + 1e-6:
+                return
             before = (index, time, frame)
         if before is not None and before[0] > taken:
             at = self.sampling.wanted(number)

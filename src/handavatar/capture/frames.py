@@ -74,6 +74,10 @@ ones are binned towards it (:meth:`Frame.binned`)."""
 _UNKNOWN_GREY = 128
 PINHOLE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
 """Of nerfstudio's ``camera_model``: pinholes, with or without a lens that bends lines."""
+_CAMERA_KEYS = (
+    *("w", "h", "fl_x", "fl_y", "cx", "cy"),
+    *("k1", "k2", "k3", "k4", "p1", "p2", "transform_matrix"),
+)
 COVARIANCES = "covariances.safetensors"
 """File of a capture: tensor ``covariance``, one matrix per frame, in the order of the frames."""
 LANDMARKS = "landmarks.safetensors"
@@ -461,6 +465,15 @@ def read_capture(folder: Path) -> Capture:
     return capture
 
 
+def common_camera(content: dict[str, Any]) -> dict[str, Any]:
+    """What a transforms.json says of the cameras of all frames; the rest may be very much.
+
+    Args:
+        content: of the file.
+    """
+    return {name: content[name] for name in _CAMERA_KEYS if name in content}
+
+
 def opencv_from_opengl(world_from_camera: np.ndarray) -> Float[Tensor, "4 4"]:
     """``camera_from_world`` in OpenCV axes of a camera-to-world matrix in OpenGL axes."""
     flipped = world_from_camera @ np.diag([1.0, -1.0, -1.0, 1.0])
@@ -489,6 +502,7 @@ def examine_files(folder: Path) -> tuple[Capture | None, list[Problem]]:
             )
     except CaptureError as error:
         return None, [Problem("transforms.json", "", error.what, error.remedy)]
+    common = common_camera(content)
     records: dict[str, FrameRecord] = {}
     problems: list[Problem] = []
     for index, entry in enumerate(entries):
@@ -497,7 +511,7 @@ def examine_files(folder: Path) -> tuple[Capture | None, list[Problem]]:
             if not isinstance(entry, dict):
                 raise CaptureError("the frame is not a JSON object", "write it as {...}")
             label = Path(str(entry.get("file_path", label))[:200]).stem
-            record = _record(folder, content, entry, index)
+            record = _record(folder, common, entry, index)
             if record.name in records:
                 raise CaptureError(
                     f"two frames are named {record.name}", "give every picture its own name"
@@ -555,9 +569,7 @@ def _header(content: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def _record(
-    folder: Path, content: dict[str, Any], entry: dict[str, Any], index: int
-) -> FrameRecord:
+def _record(folder: Path, common: dict[str, Any], entry: dict[str, Any], index: int) -> FrameRecord:
     file_path = path_inside(folder, entry.get("file_path"))
     mask_path = path_inside(folder, entry.get("mask_path"))
     size = _size_of_picture(file_path, ("RGB",))
@@ -568,7 +580,7 @@ def _record(
             f"the picture {size[0]} x {size[1]}",
             "make both the same size",
         )
-    camera = _camera({**content, **entry}, size)
+    camera = _camera({**common, **entry}, size)
     known_path = entry.get("known_path")
     if known_path is not None:
         known_path = path_inside(folder, known_path)

@@ -85,7 +85,7 @@ def _pictures(
     by_index = _by_name(files, names) if names else _by_number(files, masks, max(hands, default=0))
     for index, file in by_index.items():
         if index in hands:
-            yield index, _read(file)
+            yield index, read_mask(file)
 
 
 def _by_name(files: list[Path], names: dict[int, str]) -> dict[int, Path]:
@@ -119,22 +119,30 @@ def _by_number(files: list[Path], masks: Path, last: int) -> dict[int, Path]:
     return {number - first: file for number, file in found.items()}
 
 
-def _read(file: Path) -> UInt8[np.ndarray, "height width 3"]:
-    """A mask as 0 and 255, whatever its levels."""
+def read_mask(file: Path) -> UInt8[np.ndarray, "height width 3"]:
+    """A mask as 0 and 255, whatever its levels.
+
+    Args:
+        file: a picture; its alpha, its labels (0 is none), or its grey levels say what is hand.
+
+    Raises:
+        CaptureError: it is damaged, or shows several objects.
+    """
     picture = open_picture_file(file)
     if picture.mode in ("RGBA", "LA"):
-        picture = picture.getchannel("A")
+        grey = decoded(picture, str(file))[..., -1]
     elif picture.mode == "P":
         # Labels of objects, as segmentation programs write them; 0 is none of them.
-        labels = np.asarray(picture)
+        labels = decoded(picture, str(file))
         objects = np.unique(labels[labels > 0])
         if len(objects) > 1:
             raise CaptureError(
                 f"{file}: labels {', '.join(map(str, objects[:5].tolist()))}: several objects",
                 "give masks of the hand alone",
             )
-        picture = Image.fromarray((labels > 0).astype(np.uint8) * np.uint8(255))
-    grey = decoded(picture.convert("L"), str(file), "L")
+        grey = (labels > 0).astype(np.uint8) * np.uint8(255)
+    else:
+        grey = decoded(picture, str(file), "L")
     if grey.max() == 1:
         grey = grey * np.uint8(255)
     return np.repeat(grey[..., None], 3, axis=2)

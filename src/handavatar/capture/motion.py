@@ -36,6 +36,7 @@ from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import find_not_finite
 
 SCHEMA = 1
+_LEAST_FPS, _MOST_FPS = 0.01, 1000.0
 LONG_GAP = 0.75
 """Seconds without a pose that are told."""
 
@@ -204,7 +205,7 @@ def read_motion(path: Path) -> Motion:
                 f"schema is {str(content.get('schema'))[:20]}, this program reads {SCHEMA}",
                 'write "schema": 1, or update handavatar',
             )
-        fps = number(content.get("fps"), "fps", 0.01, 1000.0)
+        fps = number(content.get("fps"), "fps", _LEAST_FPS, _MOST_FPS)
         rotations = rotations_of(content.get("rotations"))
         translations = translations_of(content.get("translations"), len(rotations), fps)
     except CaptureError as error:
@@ -247,13 +248,20 @@ def evenly_spaced(
         tell: called where there is no pose for long.
 
     Raises:
-        CaptureError: these are more steps than a motion may have.
+        CaptureError: these are more steps than a motion may have, or too few or many a second.
     """
-    count = int(float(times[-1] - times[0]) * fps + 1e-6) + 1
-    if count > MAX_STEPS:
+    if not _LEAST_FPS <= fps <= _MOST_FPS:
         raise CaptureError(
-            f"{count} steps at {fps:g} a second; {MAX_STEPS} at most", "choose a smaller `fps`"
+            f"{fps:.3g} steps a second, expected {_LEAST_FPS:g} to {_MOST_FPS:g}",
+            "say another rate with `fps`",
         )
+    span = float(times[-1] - times[0])
+    if not span * fps < MAX_STEPS:
+        raise CaptureError(
+            f"{span * fps:.6g} steps at {fps:g} a second; {MAX_STEPS} at most",
+            "choose a smaller `fps`",
+        )
+    count = int(span * fps + 1e-6) + 1
     if len(times) == 1:
         return Motion(fps, axis_angle_from_matrix(rotations).float(), translations.float())
     gaps = times.diff()

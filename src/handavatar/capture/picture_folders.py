@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, ImageCms, ImageOps
+from PIL import Image, ImageCms
 
 from handavatar.capture.checks import (
     NUMBERED,
@@ -29,6 +29,17 @@ from handavatar.capture.decoding import (
     video_frames,
     working_size,
 )
+
+_TURNS: dict[object, Image.Transpose] = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What brings pictures upright, by what EXIF says."""
 
 
 def frames_of(source: Path, sampling: Sampling, tell: Tell) -> Iterator[VideoFrame]:
@@ -131,7 +142,7 @@ def _entries(folder: Path) -> list[Path]:
 def _natural_order(name: str) -> list[tuple[int, str]]:
     """So that 2 comes before 10."""
     parts = re.split(r"(\d+)", name)
-    return [(int(part), "") if part.isdigit() else (0, part) for part in parts]
+    return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
 
 
 def open_picture_file(file: Path) -> Image.Image:
@@ -159,20 +170,32 @@ def _upright_size(file: Path) -> tuple[int, int]:
     with open_picture_file(file) as picture:
         width, height = picture.size
         check_size(file, width, height)
-        is_turned = picture.getexif().get(0x0112) in (5, 6, 7, 8)
+        is_turned = _orientation(picture) in (5, 6, 7, 8)
     return (height, width) if is_turned else (width, height)
 
 
-def _read(file: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 3"]:
-    picture = open_picture_file(file)
+def _orientation(picture: Image.Image) -> object:
+    """How EXIF says that it is still to be turned; what cannot be read asks for nothing."""
+    if picture.format == "TIFF":
+        # Pillow turns these itself, and their size is that of the upright picture.
+        return None
     try:
+        return picture.getexif().get(0x0112)
+    except Exception:  # Of whatever kind: as in :func:`is_to_be_turned`.
+        return None
+
+
+def _read(file: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 3"]:
+    picture = opened = open_picture_file(file)
+    try:
+        picture.load()
         profile = picture.info.get("icc_profile")
         if picture.mode.startswith(("I", "F")):
             # Sixteen bits a pixel.
             levels = np.asarray(picture, dtype=np.float64) / 257
             picture = Image.fromarray(levels.round().clip(0, 255).astype(np.uint8))
-        upright = ImageOps.exif_transpose(picture)
-        colored = _srgb(upright, profile)
+        turn = _TURNS.get(_orientation(opened))
+        colored = _srgb(picture if turn is None else picture.transpose(turn), profile)
     except MemoryError:
         raise
     except Exception as error:  # Of whatever kind: decoders stumble over damage in many ways.

@@ -8,6 +8,7 @@ looks at them, so that all that follows knows pinholes alone.
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,13 @@ from torch import Tensor
 
 from handavatar.capture.checks import CaptureError, load_json, number, text_field
 from handavatar.capture.decoding import Tell, have_same_shape
-from handavatar.capture.frames import PINHOLE_MODELS, opencv_from_opengl, read_transform
+from handavatar.capture.frames import (
+    MAX_FRAMES,
+    PINHOLE_MODELS,
+    common_camera,
+    opencv_from_opengl,
+    read_transform,
+)
 from handavatar.capture.masks import load_opencv
 from handavatar.geometry.rotations import matrix_from_quaternion, rigid_transform
 
@@ -134,7 +141,12 @@ def _from_transforms(file: Path) -> KnownCamera:
     entries = content.get("frames", [])
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise CaptureError("frames is not a list of objects", "write it as nerfstudio does")
-    lenses = {_lens_of({**content, **entry}) for entry in entries} or {_lens_of(content)}
+    if len(entries) > MAX_FRAMES:
+        raise CaptureError(
+            f"{len(entries)} frames, at most {MAX_FRAMES} are read", "leave some out"
+        )
+    common = common_camera(content)
+    lenses = {_lens_of({**common, **entry}) for entry in entries} or {_lens_of(common)}
     if len(lenses) > 1:
         raise CaptureError(
             f"{len(lenses)} different cameras", "one video has one camera: give each its own file"
@@ -177,7 +189,7 @@ def _add_view(views: dict[str, Float[Tensor, "4 4"]], name: str, view: Tensor) -
 
 
 def _from_colmap(folder: Path) -> KnownCamera:
-    cameras = list(_colmap_lines(folder / "cameras.txt"))
+    cameras = list(_colmap_lines(folder / "cameras.txt", 13))
     lenses = {}
     for line, words in cameras:
         where = f"{folder / 'cameras.txt'}, line {line}"
@@ -202,7 +214,8 @@ def _from_colmap(folder: Path) -> KnownCamera:
     used = set()
     if (folder / "images.txt").is_file():
         # Every other line lists the picture's points, and may be empty.
-        for line, words in list(_colmap_lines(folder / "images.txt", keeps_empty=True))[::2]:
+        lines = _colmap_lines(folder / "images.txt", 10, keeps_empty=True)
+        for line, words in islice(lines, 0, None, 2):
             where = f"{folder / 'images.txt'}, line {line}"
             if len(words) < 10:
                 raise CaptureError(f"{where}: {len(words)} words, expected 10", "write it again")
@@ -211,8 +224,11 @@ def _from_colmap(folder: Path) -> KnownCamera:
                 raise CaptureError(f"{where}: the quaternion has not length 1", "write it again")
             shift = torch.tensor(_floats(words[5:8], 3, where), dtype=torch.float64)
             used.add(words[8])
-            name = Path(" ".join(words[9:])).name
-            _add_view(views, name, rigid_transform(matrix_from_quaternion(turn), shift).float())
+            _add_view(
+                views,
+                Path(words[9]).name,
+                rigid_transform(matrix_from_quaternion(turn), shift).float(),
+            )
     chosen = {lenses.get(name) for name in used} if used else set(lenses.values())
     if len(chosen) != 1 or None in chosen:
         raise CaptureError(
@@ -224,18 +240,22 @@ def _from_colmap(folder: Path) -> KnownCamera:
     return KnownCamera(lens, folder.name, views)
 
 
-def _colmap_lines(file: Path, keeps_empty: bool = False) -> Iterator[tuple[int, list[str]]]:
-    """Numbers and words of the lines that are no comments."""
+def _colmap_lines(
+    file: Path, most_words: int, keeps_empty: bool = False
+) -> Iterator[tuple[int, list[str]]]:
+    """Numbers and words of the lines that are no comments; the last word is all that is left."""
     if file.stat().st_size > _MAX_BYTES:
         raise CaptureError(
             f"{file}: more than {_MAX_BYTES >> 20} MiB", "leave out the points of images.txt"
         )
     started = False
-    for line, text in enumerate(file.read_text("utf-8", errors="replace").splitlines(), 1):
-        if text.startswith("#") or (not text.strip() and not (keeps_empty and started)):
-            continue
-        started = True
-        yield line, text.split()
+    with file.open(encoding="utf-8", errors="replace") as lines:
+        for line, text in enumerate(lines, 1):
+            if text.startswith("#") or (not text.strip() and not (keeps_empty and started)):
+                continue
+            started = True
+            # A picture's name may hold blanks, and its points be very many.
+            yield line, text.strip().split(maxsplit=most_words - 1)
 
 
 def _floats(words: list[str], count: int, where: str) -> list[float]:

@@ -243,7 +243,7 @@ def print_figures(value: dict[str, Any], indent: int = 0) -> None:
     """Nested results as indented lines for a person."""
     width = max((len(str(name)) for name in value), default=0)
     for name, figure in value.items():
-        label = " " * indent + f"{name:<{width}}"
+        label = shown(" " * indent + f"{name:<{width}}")
         if isinstance(figure, dict):
             print(label.rstrip())
             print_figures(figure, indent + 2)

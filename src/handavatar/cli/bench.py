@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from handavatar.cli.failures import USAGE
+from handavatar.errors import printable
 from handavatar.jobs.progress import Progress
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ def bench(words: list[str], progress: Progress) -> int:
     if extras["json"]:
         print_json(table.record())
     else:
-        print(table.markdown())
+        print(printable(table.markdown()))
     return 0
 
 

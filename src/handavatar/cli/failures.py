@@ -7,7 +7,13 @@ import shlex
 import sys
 import traceback
 
-from handavatar.errors import ARGUMENT_MARK, ErrorKind, HandAvatarError, machine_error
+from handavatar.errors import (
+    ARGUMENT_MARK,
+    ErrorKind,
+    HandAvatarError,
+    machine_error,
+    printable,
+)
 
 OUR_BUG = 1
 USAGE = int(ErrorKind.USAGE)
@@ -48,23 +54,6 @@ def report_failure(error: BaseException, is_debugging: bool = False) -> int:
         lines = [*lines[: _MAX_LINES - 1], "this is a mistake in handavatar: --debug shows where"]
     print("\n".join(["handavatar: " + lines[0], *lines[1:_MAX_LINES]]), file=sys.stderr)
     return code
-
-
-def printable(text: str) -> str:
-    """A text that may hold anything, so that a terminal shows it and obeys nothing in it.
-
-    What controls a terminal or turns the direction of writing is written as its code, and so is
-    what is no character at all. Line breaks stay.
-
-    Args:
-        text: with parts that come from a file or a file's name.
-    """
-    return "".join(
-        sign
-        if sign == "\n" or sign.isprintable()
-        else sign.encode("unicode_escape").decode("ascii")
-        for sign in text
-    )
 
 
 def with_flags(text: str) -> str:

@@ -13,6 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar, Rendering, chosen_device
+from handavatar.capture.checks import decoded, load_json, open_picture
 from handavatar.capture.frame_sequence import spread_numbers
 from handavatar.capture.frames import (
     FITTED_SIDE,
@@ -52,6 +53,7 @@ from handavatar.evaluate.unseen import unseen_figures, unseen_pictures
 from handavatar.fit.register import RegisterOptions
 from handavatar.hand.pose import HandPose
 from handavatar.jobs.files import FolderKind, fill_folder, refuse_folder_in_use, write_atomically
+from handavatar.jobs.logs import finite_figures, is_step, json_lines
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.video_writer import VideoWriter
 
@@ -243,8 +245,7 @@ def _opened(options: EvaluateOptions) -> tuple[HandAvatar, Capture, Path]:
         avatar = HandAvatar.load(run)
         folder = options.capture
         if folder is None:
-            facts = json.loads((run / "run.json").read_text())
-            folder = Path(facts["capture"]["path"])
+            folder = _capture_of(run)
         out = options.out or run / "evaluation"
     else:
         folder = options.capture
@@ -253,6 +254,17 @@ def _opened(options: EvaluateOptions) -> tuple[HandAvatar, Capture, Path]:
         avatar = HandAvatar.load(run)
         out = options.out or run.parent / f"{run.stem}-evaluation"
     return avatar, read_capture(folder), out
+
+
+def _capture_of(run: Path) -> Path:
+    """The folder that a run says it was trained on."""
+    capture = load_json(run / "run.json").get("capture")
+    folder = capture.get("path") if isinstance(capture, dict) else None
+    if not isinstance(folder, str):
+        raise CaptureError(
+            f"{run}: its run.json does not say of which capture it is", "name one with `capture`"
+        )
+    return Path(folder)
 
 
 def _on_cpu(rendering: Rendering) -> Rendering:
@@ -394,10 +406,9 @@ _DROPPED = ("dropped", "skipped", "left_out")
 def _object(path: Path) -> dict[str, Any]:
     """A JSON file's object; an empty one if there is none."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return load_json(path)
+    except (OSError, CaptureError):
         return {}
-    return content if isinstance(content, dict) else {}
 
 
 def _against_truth(
@@ -451,8 +462,7 @@ _TRUTH = ("albedo", "shading")
 
 def float_image(file: Path) -> Tensor:
     """A picture's values in [0, 1], as stored."""
-    with Image.open(file) as image:
-        return torch.from_numpy(np.asarray(image).astype(np.float32) / 255)
+    return torch.from_numpy(decoded(open_picture(file), str(file)).astype(np.float32) / 255)
 
 
 def pictures_of(rendering: Rendering) -> dict[str, np.ndarray]:
@@ -564,11 +574,15 @@ def _curves(run: Path) -> list[Curve]:
     log = run / "log.jsonl"
     if not log.is_file():
         return []
-    records = [json.loads(line) for line in log.read_text().splitlines() if line.endswith("}")]
+    records = [
+        (record["step"], finite_figures(record))
+        for _, record in json_lines(log.read_bytes())
+        if is_step(record.get("step"))
+    ]
     return [
         Curve(
             f"{name}, mean of 20 steps",
-            _averaged([(record["step"], record[name]) for record in records if name in record]),
+            _averaged([(step, figures[name]) for step, figures in records if name in figures]),
         )
         for name in ("psnr", "silhouette", "color")
     ]

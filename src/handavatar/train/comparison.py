@@ -6,7 +6,6 @@ reached is kept as ``NAME-SEED.json`` beside its weights; where that file is the
 options, nothing is trained again, so that seeds can be added one by one, on several machines.
 """
 
-import json
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,6 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from handavatar.capture.checks import load_json
 from handavatar.errors import SEEDS, ArgumentError, require_ranges
 from handavatar.evaluate.intervals import mean_interval
 from handavatar.evaluate.tables import TABLES, Cell, ResultTable
@@ -334,7 +334,7 @@ def _training(
     depends_on |= {"decoder": contender.decoder, "rounds": contender.rounds, "seed": seed}
     kept = options.priors / f"{name}.json"
     if kept.is_file():
-        training: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
+        training = load_json(kept)
         if training.get("options") == depends_on:
             return training
     start = time.perf_counter()

@@ -26,6 +26,7 @@ from safetensors import SafetensorError
 
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
+from handavatar.errors import printable
 from handavatar.jobs.files import write_atomically
 from handavatar.jobs.finite import NotFinite
 from handavatar.jobs.processes import is_running
@@ -213,7 +214,9 @@ class _Live:
         except (OSError, SafetensorError) as error:
             self._is_broken = True
             print(
-                f"{live_folder(self._run)}: {error}; nobody can look on, training goes on",
+                printable(
+                    f"{live_folder(self._run)}: {error}; nobody can look on, training goes on"
+                ),
                 file=sys.stderr,
             )
 

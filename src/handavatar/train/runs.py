@@ -46,6 +46,7 @@ from handavatar.jobs.files import (
 )
 from handavatar.jobs.finite import find_not_finite, require_finite
 from handavatar.jobs.locks import LockHeld, hold_lock
+from handavatar.jobs.logs import is_step, json_lines
 from handavatar.train.provenance import package_versions, source_commit
 
 Json = dict[str, Any]
@@ -306,19 +307,10 @@ def truncate_log(run: Run, step: int) -> None:
 
 
 def _log_lines(run: Run) -> Iterator[tuple[bytes, Json]]:
-    if not run.log.exists():
-        return
-    for line in run.log.read_bytes().splitlines(keepends=True):
-        try:
-            record = json.loads(line)
-        except ValueError:
-            continue
-        if (
-            line.endswith(b"\n")
-            and isinstance(record, dict)
-            and isinstance(record.get("step"), int)
-        ):
-            yield line, record
+    if run.log.exists():
+        for line, record in json_lines(run.log.read_bytes()):
+            if is_step(record.get("step")):
+                yield line, record
 
 
 # --- checkpoints ----------------------------------------------------------------------------------

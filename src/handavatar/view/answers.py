@@ -51,7 +51,8 @@ class AvatarAnswers:
             motion = self._studio.motion(query.get("name", ""))
             return json_answer({"fps": motion.fps, "steps": len(motion)})
         if path == "/angles":
-            step = int(query["step"]) if query.get("step", "")[:7].isdecimal() else -1
+            text = query.get("step", "")
+            step = int(text) if text.isdecimal() and len(text) <= 7 else -1
             moment = Moment(query.get("motion", ""), whole(step, "step", 0, MOST_STEPS))
             return json_answer({"angles": self._studio.angles(moment)})
         if path == "/film":

@@ -14,7 +14,7 @@ from importlib import resources
 from typing import Any, Protocol
 from urllib.parse import parse_qs, urlsplit
 
-from handavatar.errors import ArgumentError, HandAvatarError, machine_error
+from handavatar.errors import ArgumentError, HandAvatarError, machine_error, printable
 from handavatar.view.guard import POSTED_KINDS, Guard, Refused
 from handavatar.view.limits import Connections, Limits
 from handavatar.view.scene import SceneError
@@ -189,7 +189,7 @@ class _Handler(BaseHTTPRequestHandler):
         except Exception as error:  # one answer fails, the server goes on
             known = error if isinstance(error, HandAvatarError) else machine_error(error)
             said = str(known)[:400] if known else f"{type(error).__name__}: {str(error)[:200]}"
-            print(f"view: {said}", file=sys.stderr)
+            print(printable(f"view: {said}"), file=sys.stderr)
             answer = self._failure(500, said)
         self._send(answer)
 

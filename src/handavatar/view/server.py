@@ -20,7 +20,7 @@ import torch
 
 from handavatar.avatar import HandAvatar, RenderSettings, chosen_device
 from handavatar.capture.motion import MOTIONS, Motion, read_motion
-from handavatar.errors import require_range, require_ranges
+from handavatar.errors import printable, require_range, require_ranges
 from handavatar.field.kernels import Kernel, chosen_kernel
 from handavatar.jobs.signals import awaited_signals
 from handavatar.jobs.threads import step_back
@@ -254,7 +254,7 @@ def keep_serving(
                 shown.refresh()
             except (OSError, ValueError) as error:  # of a file; said, and tried again
                 if (why := str(error).splitlines()[0]) != said:
-                    print(f"view: {why}", file=sys.stderr, flush=True)
+                    print(printable(f"view: {why}"), file=sys.stderr, flush=True)
                     said = why
             looked = time.monotonic()
         if not is_stopped():

@@ -1,7 +1,6 @@
 """A run that is being trained, as a page shows it: its frames, its losses, its avatar as it is."""
 
 import copy
-import json
 import os
 import threading
 import time
@@ -21,6 +20,7 @@ from handavatar.capture.frames import Capture, Frame, read_capture
 from handavatar.capture.view import start_of
 from handavatar.edit import Edit
 from handavatar.hand.pose import HandPose
+from handavatar.jobs.logs import finite_figures, is_step, json_lines
 from handavatar.train.live import LiveState, live_avatar, live_poses, look_on, read_live
 from handavatar.train.runs import Run
 from handavatar.view.baked import BakedAvatar
@@ -296,12 +296,10 @@ class _Curves:
             return
         whole = data[: data.rfind(b"\n") + 1]
         self._place += len(whole)
-        for line in whole.splitlines():
-            try:
-                record = json.loads(line)
-                self._note("train", record.pop("step"), record)
-            except (ValueError, KeyError):  # torn by a kill
-                continue
+        for _, record in json_lines(whole):
+            step = record.pop("step", None)
+            if is_step(step):
+                self._note("train", step, finite_figures(record))
 
 
 class _Curve:

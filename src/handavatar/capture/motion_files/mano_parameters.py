@@ -39,6 +39,7 @@ WHOLE_NAMES = ("pose", "poses", "full_pose", "mano_pose", "thetas")
 PLACE_NAMES = ("transl", "trans", "translation")
 _FINGER_VALUES = 45
 _SIDES: tuple[Side, Side] = ("left", "right")
+_FRAME = re.compile(r"[0-9]{1,15}")
 _NAMED_SIDE = re.compile(r".*[_-](left|right)", re.IGNORECASE)
 
 
@@ -159,7 +160,7 @@ def _hands_of_frames(part: Part) -> list[tuple[int, Side, Fields]]:
 
 def _is_table_of_frames(content: dict[str, Any]) -> bool:
     return bool(content) and all(
-        name.isdigit() and isinstance(hands, dict) and set(hands) & set(_SIDES)
+        _FRAME.fullmatch(name) and isinstance(hands, dict) and set(hands) & set(_SIDES)
         for name, hands in content.items()
     )
 
