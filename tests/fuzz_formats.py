@@ -50,11 +50,15 @@ from handavatar.capture.soundness import find_problems
 from handavatar.capture.video_cameras import pinhole_of, read_camera
 from handavatar.capture.view import start_of, view_of
 from handavatar.cli.inputs import kind_of
+from handavatar.hand.detail import refined, subdivided
 from handavatar.hand.mano import read_mano
 from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rigs import read_rig
+from handavatar.hand.skin_refinement import strongest_bones
+from handavatar.hand.sparse_skin import SparseSkin
 from handavatar.retouch import paint_from
+from handavatar.synthetic.truth import encoded_masks, read_film_truth
 from handavatar.tracker.model import read_tracker
 from handavatar.train.live import LiveState, live_folder, read_live
 from handavatar.train.prior import SHIPPED_PRIOR, open_prior
@@ -309,6 +313,38 @@ def _run(folder: Path) -> Run:
     return create_run(folder / "run", {"method": "quick"}, **facts)
 
 
+def _skin(folder: Path, avatar: HandAvatar) -> Format:
+    rig = load_open_hand("778")
+    fine = subdivided(rig, 1)
+    file = folder / "skin.safetensors"
+    SparseSkin.of(strongest_bones(fine.skin_weights), rig, 1).save(file)
+    return Format(file, changed_tensors, lambda: refined(rig, 1, file, fine))
+
+
+def _film_truth(folder: Path, avatar: HandAvatar) -> list[Format]:
+    rig = load_open_hand("778")
+    masks, ends = encoded_masks([np.zeros((48, 64), np.uint8)] * 2)
+    arrays = {"rotations": torch.zeros(2, 16, 3), "translations": torch.zeros(2, 3)}
+    arrays |= {"shape_coefficients": torch.zeros(10), "rest_vertices": rig.template_vertices}
+    arrays |= {"gains": torch.ones(2, 3), "inside": torch.ones(2)}
+    facts = {"schema": 1, "rig_name": rig.name, "rig_sha256": rig.sha256, "size": [64, 48]}
+    facts |= {"focal": 60.0, "center": [32.0, 24.0], "fps": 30.0, "options": {"seed": 1}}
+    file = folder / "film.safetensors"
+    save_file(arrays | {"mask_bytes": masks, "mask_ends": ends}, file)
+    file.with_suffix(".json").write_text(json.dumps(facts))
+
+    def read() -> None:
+        truth = read_film_truth(file)
+        for frame in range(len(truth)):
+            truth.mask(frame)
+            truth.posed(frame)
+
+    return [
+        Format(file, changed_tensors, read),
+        Format(file.with_suffix(".json"), changed_json_bytes, read),
+    ]
+
+
 def _videos(folder: Path, avatar: HandAvatar) -> list[Format]:
     def of(film: Film) -> Format:
         file = save_film(folder, film)
@@ -432,6 +468,8 @@ FORMATS: dict[str, Callable[[Path, HandAvatar], Format | list[Format]]] = {
     "pictures": _pictures,
     "given masks": _given_masks,
     "cameras": _cameras,
+    "skin": _skin,
+    "film truth": _film_truth,
 }
 
 

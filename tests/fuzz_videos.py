@@ -45,7 +45,7 @@ FILMS = (
     Film("hevc.mp4", "libx265", "yuv420p10le"),
     Film("av1.mp4", "libsvtav1"),
     Film("camera.mov", "mjpeg", "yuvj422p", has_sound=True),
-    Film("palette.mov", "png", "pal8"),
+    Film("grey.mov", "png", "gray16be"),
     Film("wide.mkv", "libx264", aspect=Fraction(4, 3)),
     Film("vp9.webm", "libvpx-vp9"),
     Film("vp8.webm", "libvpx"),
@@ -57,7 +57,7 @@ FILMS = (
     Film("h264.flv", "libx264"),
     Film("wmv.asf", "wmv2"),
     Film("mpeg2.mxf", "mpeg2video", "yuv422p"),
-    Film("theora.ogg", "libtheora"),
+    Film("vp8.ogg", "libvpx"),
 )
 
 

@@ -259,6 +259,11 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
                     f"{path}: holds no pictures, only {_stream_kinds(container)}",
                     "give a video that shows a hand",
                 )
+            if stream.codec_context is None:
+                raise CaptureError(
+                    f"{path}: its pictures are compressed in a way that is not known here",
+                    "convert it to mp4 (H.264)",
+                )
             stream.codec_context.thread_type = "AUTO"
             yield container, stream
 

@@ -69,6 +69,11 @@ def refined(rig: Rig, rounds: int = 2, file: Path | None = None, fine: Rig | Non
                 f"{skin.rounds} rounds, expected {rig.sha256[:12]} ({rig.name}) and {rounds}; "
                 "make them with `handavatar rig refine`"
             )
+        if len(skin.bones) != fine.num_vertices:
+            raise RigError(
+                f"{file}: weights of {len(skin.bones)} vertices, expected {fine.num_vertices}; "
+                "make them again with `handavatar rig refine`"
+            )
         return replace(fine, skin_weights=skin.dense().to(fine.skin_weights))
     for name in _SHIPPED:
         with resources.as_file(resources.files("handavatar") / "assets" / name) as path:

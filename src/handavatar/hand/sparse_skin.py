@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from safetensors import safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -64,6 +64,17 @@ class SparseSkin:
         bones = torch.where(shares > 0, largest.indices, 0)
         return SparseSkin(bones, shares, base.sha256, rounds)
 
+    @property
+    def is_sound(self) -> bool:
+        """Whether every vertex hangs on one to four bones that there are, by shares of one."""
+        shape = self.bones.shape
+        if len(shape) != 2 or not shape[0] or not 0 < shape[1] <= MAX_BONES:
+            return False
+        if self.shares.shape != shape or int(self.shares.min()) < 0:
+            return False
+        is_whole = bool((self.shares.sum(-1) == _WHOLE).all())
+        return is_whole and 0 <= int(self.bones.min()) <= int(self.bones.max()) < NUM_BONES
+
     def dense(self) -> Float[Tensor, "vertices bones"]:
         """The weights as a :class:`Rig` has them."""
         weights = torch.zeros(len(self.bones), NUM_BONES, dtype=torch.float64)
@@ -101,14 +112,14 @@ class SparseSkin:
             skin = SparseSkin(
                 bones.long(), shares.to(torch.int64), header["rig_sha256"], int(header["rounds"])
             )
-            is_sound: Bool[Tensor, ""] = (skin.shares.sum(-1) == _WHOLE).all()
+            is_sound = not bones.is_floating_point() and skin.is_sound
         except Exception as error:
             raise_if_refused(error)
             raise RigError(
                 f"{path}: cannot be read as skin weights ({error}); make them again with "
                 "`handavatar rig refine`"
             ) from error
-        if header.get("schema") != SCHEMA or not bool(is_sound) or int(bones.max()) >= NUM_BONES:
+        if header.get("schema") != SCHEMA or not is_sound:
             raise RigError(
                 f"{path}: not skin weights of schema {SCHEMA} whose rows sum to {_WHOLE}; make "
                 "them again with `handavatar rig refine`"

@@ -12,12 +12,22 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from handavatar.capture.checks import CaptureError, load_json, number, numbers, text_field
+from handavatar.capture.checks import (
+    MAX_PIXELS,
+    CaptureError,
+    decoded,
+    load_json,
+    number,
+    numbers,
+    picture_in,
+    text_field,
+)
 from handavatar.errors import raise_if_refused
 from handavatar.geometry.cameras import Camera
-from handavatar.hand.pose import HandPose
+from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.rig import PosedHand, Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
+from handavatar.jobs.finite import find_not_finite
 
 SCHEMA = 1
 
@@ -83,8 +93,8 @@ class FilmTruth:
         """
         start = int(self.mask_ends[frame - 1]) if frame else 0
         encoded = self.mask_bytes[start : int(self.mask_ends[frame])].numpy().tobytes()
-        with Image.open(io.BytesIO(encoded), formats=["PNG"]) as picture:
-            grey = np.array(picture)
+        name = f"{self.name}: the mask of frame {frame}"
+        grey = decoded(picture_in(io.BytesIO(encoded), name, ("PNG",), MAX_PIXELS), name)
         if grey.shape != (self.camera.height, self.camera.width):
             raise CaptureError(
                 f"{self.name}: the mask of frame {frame} has shape {grey.shape}",
@@ -117,7 +127,11 @@ def read_film_truth(path: Path) -> FilmTruth:
         raise CaptureError(
             f"{path}: the truth cannot be read ({error})", "make it again"
         ) from error
+    rig = find_rig(text_field(content, "rig_sha256"), text_field(content, "rig_name"))
+    _check_arrays(found, rig, path)
     size = numbers(content.get("size"), (2,), "size")
+    if not (size.min() >= 1 and size.prod() <= MAX_PIXELS):
+        raise CaptureError(f"{path}: size is {size.tolist()}", "make the film again")
     focal = number(content.get("focal"), "focal", 1.0, 1e6)
     center = numbers(content.get("center"), (2,), "center")
     options = content.get("options")
@@ -130,12 +144,37 @@ def read_film_truth(path: Path) -> FilmTruth:
     )
     return FilmTruth(
         name=path.stem,
-        rig=find_rig(text_field(content, "rig_sha256"), text_field(content, "rig_name")),
+        rig=rig,
         camera=camera,
         fps=number(content.get("fps"), "fps", 0.01, 1000.0),
         options=options if isinstance(options, dict) else {},
         **found,
     )
+
+
+def _check_arrays(found: dict[str, Tensor], rig: Rig, path: Path) -> None:
+    """Refuses arrays that do not fit together, or to the rig."""
+    frames = len(found["rotations"]) if found["rotations"].ndim else 0
+    shapes = {
+        "rotations": (frames, NUM_BONES, 3),
+        "translations": (frames, 3),
+        "shape_coefficients": (rig.shape_directions.shape[-1],),
+        "rest_vertices": (rig.num_vertices, 3),
+        "gains": (frames, 3),
+        "inside": (frames,),
+        "mask_ends": (frames,),
+        "mask_bytes": (found["mask_bytes"].numel(),),
+    }
+    for name, shape in shapes.items():
+        is_of_kind = found[name].is_floating_point() != name.startswith("mask_")
+        if tuple(found[name].shape) != shape or not is_of_kind:
+            raise CaptureError(
+                f"{path}: {name} has shape {tuple(found[name].shape)} and type "
+                f"{found[name].dtype}, expected {shape}",
+                "make the film again",
+            )
+    if problem := find_not_finite(found):
+        raise CaptureError(f"{path}: {problem}", "make the film again")
 
 
 _ARRAYS = (
