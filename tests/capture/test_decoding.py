@@ -12,7 +12,7 @@ import pytest
 from videos import grey_levels, save_sound, save_video
 
 from handavatar.capture.checks import CaptureError
-from handavatar.capture.decoding import Sampling, _Decoder, video_frames
+from handavatar.capture.decoding import Sampling, _Decoder, _Scan, video_frames
 
 
 def test_every_third_picture_of_thirty_per_second(tmp_path: Path) -> None:
@@ -72,7 +72,8 @@ def test_the_frames_nearest_to_the_wanted_times_are_taken(
         is_nearer = at - times[before] <= times[after] - at + 1e-6
         wanted.append(before if is_nearer else after)
         number += 1
-    decoder = _Decoder(tmp_path, None, SimpleNamespace(average_rate=30), None, sampling, print)
+    stream, scan = SimpleNamespace(average_rate=30), _Scan((160, 120), 1, 4.0, 4.0, None)
+    decoder = _Decoder(tmp_path, None, stream, scan, sampling, print)
     decoded = [(place, time, None) for place, time in enumerate(times)]
     monkeypatch.setattr(decoder, "decoded", lambda: iter(decoded))
     found = [index for index, _, _ in decoder.wanted()]
