@@ -1,5 +1,6 @@
 """Small films of every kind that is read, and mutants of their boxes, elements and packets."""
 
+import os
 import random
 import struct
 from collections.abc import Iterator
@@ -64,11 +65,13 @@ FILMS = (
 def save_film(folder: Path, film: Film) -> Path:
     """Writes a few small pictures, in which something moves."""
     path = folder / film.name
+    os.environ.setdefault("SVT_LOG", "0")  # AV1's encoder is talkative.
     with av.open(str(path), "w", options=dict(film.options)) as container:
         container.metadata["title"] = "a hand \x1b[31m"
         stream = container.add_stream(film.codec, rate=25)
         stream.width = stream.height = _SIZE
         stream.pix_fmt = film.pixels
+        stream.options = {"x265-params": "log-level=none"} if film.codec == "libx265" else {}
         stream.codec_context.sample_aspect_ratio = film.aspect
         sound = container.add_stream("mp2", rate=16000) if film.has_sound else None
         for number in range(_NUM_PICTURES):

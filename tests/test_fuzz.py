@@ -22,7 +22,10 @@ def _faults(count: int, *names: str) -> dict[str, dict[str, int]]:
     """Of each format: how often its reader failed, and how."""
     command = [sys.executable, str(Path(__file__).with_name("fuzz_formats.py")), str(count), *names]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
+    # The last line before names the mutant, where a decoder has ended the process.
     assert done.returncode == 0, done.stderr[-2000:]
+    # What decoders print by themselves.
+    assert "Traceback" not in done.stderr and "\x1b" not in done.stderr, done.stderr[-2000:]
     return json.loads(done.stdout.splitlines()[-1])
 
 

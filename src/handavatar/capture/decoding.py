@@ -5,12 +5,14 @@ What a file says of its pictures is honoured frame by frame, as a player would: 
 its pixels, times of the frames, edit lists. What had to be guessed, changed or left out is told.
 """
 
+import errno
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import av
 import numpy as np
@@ -234,13 +236,31 @@ def _check_file(path: Path) -> None:
         )
 
 
+class _Source:
+    """A file as FFmpeg reads it; damaged files send it to places that there are not.
+
+    PyAV keeps an exception of such a call, raises it from a later one, and prints it if there are
+    two. A negative number is what FFmpeg understands.
+    """
+
+    def __init__(self, file: BinaryIO) -> None:
+        self.name, self.read, self.tell, self._file = file.name, file.read, file.tell, file
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Goes to a place; tells which, or a negative number if there is none."""
+        try:
+            return self._file.seek(offset, whence)
+        except (OSError, ValueError):
+            return -errno.EINVAL
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """The container and its pictures."""
     with path.open("rb") as file:
         try:
             container = av.open(
-                file,
+                _Source(file),
                 mode="r",
                 options={"format_whitelist": _DEMUXERS},
                 **_ANY_TITLE,
