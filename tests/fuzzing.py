@@ -163,7 +163,7 @@ def changed_text(data: bytes, chance: random.Random) -> bytes:
         return changed_bytes(data, chance)
     lines = [line.split(" ") for line in data.decode().split("\n")]
     for _ in range(chance.choice((1, 1, 2, 3))):
-        words = chance.choice(lines)
+        words = chance.choice([words for words in lines if words] or [[""]])
         place = chance.randrange(len(words))
         match chance.randrange(4):
             case 0 | 1:

@@ -1,8 +1,10 @@
 """What is read from a video file, and what is refused."""
 
+import os
 import random
 import struct
 import time
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,7 +14,7 @@ import pytest
 from videos import grey_levels, save_sound, save_video
 
 from handavatar.capture.checks import CaptureError
-from handavatar.capture.decoding import Sampling, _Decoder, _Scan, video_frames
+from handavatar.capture.decoding import Sampling, _Decoder, _Scan, _Source, video_frames
 
 
 def test_every_third_picture_of_thirty_per_second(tmp_path: Path) -> None:
@@ -53,6 +55,47 @@ def test_times_that_jump_are_no_endless_film(tmp_path: Path) -> None:
     frames = list(video_frames(path, Sampling(fps=30.0)))
     assert [frame.index for frame in frames] == [0, 1, 2, 3] and frames[3].time > 1e11
     assert time.process_time() - begin < 5.0
+
+
+def test_pictures_that_become_too_large_are_not_decoded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A small file made 2 GB of them: its first pictures were as large as the file says."""
+    monkeypatch.setattr("handavatar.capture.decoding.MAX_PIXELS", 20_000)
+    small = save_video(tmp_path / "small.ts", grey_levels(6), codec="mpeg2video")
+    assert len(list(video_frames(small, Sampling(fps=30.0)))) == 6
+    large = save_video(tmp_path / "large.ts", grey_levels(6, (320, 240)), codec="mpeg2video")
+    (tmp_path / "both.ts").write_bytes(small.read_bytes() + large.read_bytes())
+    assert "breaks off" in _refusal(tmp_path / "both.ts")
+
+
+def test_damaged_files_print_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """PyAV printed tracebacks of seeks to places before the beginning."""
+    with (tmp_path / "a.bin").open("wb+") as file:
+        source = _Source(file)
+        assert source.seek(-5) < 0 and source.seek(-1, os.SEEK_CUR) < 0
+        assert source.seek(7) == 7 and source.tell() == 7
+    whole = save_video(tmp_path / "a.avi", grey_levels(6)).read_bytes()
+    chance = random.Random(0)
+    for _ in range(30):
+        damaged = bytearray(whole)
+        for _ in range(3):
+            place = chance.randrange(len(damaged) - 8)
+            damaged[place : place + 8] = chance.choice((b"\xff" * 8, bytes(8)))
+        (tmp_path / "a.avi").write_bytes(damaged)
+        with suppress(CaptureError):
+            list(video_frames(tmp_path / "a.avi"))
+    assert capfd.readouterr().err == ""
+
+
+def test_pictures_of_an_unknown_kind_are_refused(tmp_path: Path) -> None:
+    path = save_video(tmp_path / "a.mp4", grey_levels(3))
+    content = path.read_bytes()
+    assert content.count(b"mp4v") == 1
+    path.write_bytes(
+        content.replace(b"mp4v", b"xyzw").replace(b"\x04\x80\x80\x80", b"\x05\x80\x80\x80")
+    )
+    assert "compressed in a way that is not known" in _refusal(path)
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -285,6 +285,8 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
                     "convert it to mp4 (H.264)",
                 )
             stream.codec_context.thread_type = "AUTO"
+            # Of what grows behind its header. Pictures are compressed with some more rows and columns.
+            stream.codec_context.options = {"max_pixels": str(2 * MAX_PIXELS)}
             yield container, stream
 
 
