@@ -15,7 +15,7 @@ from fuzzing import fault_of
 MANY = 2000
 FEW = 10
 _QUICK = ("capture", "mask", "motion", "paint", "rig", "run.json", "log.jsonl", "progress.json")
-_QUICK += ("cameras", "given masks", "pictures")
+_QUICK += ("cameras", "given masks", "pictures", "skin", "film truth")
 
 
 def _faults(count: int, *names: str) -> dict[str, dict[str, int]]:

@@ -286,7 +286,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
                 )
             stream.codec_context.thread_type = "AUTO"
             # Of what grows behind its header. Pictures are compressed with some more rows and columns.
-            stream.codec_context.options = {"max_pixels": str(2 * MAX_PIXELS)}
+            stream.codec_context.options = {"max_pixels": str(MAX_PIXELS * 9 // 8)}
             yield container, stream
 
 
