@@ -61,7 +61,7 @@ def test_pictures_that_become_too_large_are_not_decoded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A small file made 2 GB of them: its first pictures were as large as the file says."""
-    monkeypatch.setattr("handavatar.capture.decoding.MAX_PIXELS", 20_000)
+    monkeypatch.setattr("handavatar.capture.decoding.MAX_PIXELS", 30_000)
     small = save_video(tmp_path / "small.ts", grey_levels(6), codec="mpeg2video")
     assert len(list(video_frames(small, Sampling(fps=30.0)))) == 6
     large = save_video(tmp_path / "large.ts", grey_levels(6, (320, 240)), codec="mpeg2video")
