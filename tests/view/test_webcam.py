@@ -157,6 +157,8 @@ def test_pictures_that_are_none_are_refused(
     Image.fromarray(hand_pictures[0]).save(buffer, "PNG")
     assert status(query, buffer.getvalue()) == 400
     assert status(query, jpeg(np.zeros((1500, 1500, 3), np.uint8))) == 400
+    for strip in ((1, 60_000), (60_000, 1), (16, 130)):
+        assert status(query, jpeg(np.zeros((*strip, 3), np.uint8))) == 400
     assert refused(server.port, query, "image/jpeg", MOST_CAMERA_BYTES + 1) == 413
     for kind in ("image/png", "application/json", "text/plain", "application/octet-stream"):
         assert status(query, good, kind) == 415

@@ -28,6 +28,7 @@ from handavatar.webcam.session import LiveSession
 LONGER_SIDE = 640
 """Pixels of the pictures that a page sends, along their longer side."""
 _MOST_PIXELS = 1 << 21
+_LONGEST_RATIO = 8
 _MOST_WAITING = 4
 """Pictures that wait for their turn; more are asked to try again."""
 _FORGOTTEN = 3.0
@@ -221,10 +222,14 @@ def read_picture(content: bytes) -> UInt8[np.ndarray, "height width 3"]:
     """A camera's picture.
 
     Raises:
-        SceneError: if it is no JPEG, or too large.
+        SceneError: if it is no JPEG, too large, or a strip.
     """
     try:
         picture = picture_in(io.BytesIO(content), "the picture", ("JPEG",), _MOST_PIXELS)
+        width, height = picture.size
+        # Hands are looked for along the longer side: in a strip of pixels for ten seconds.
+        if max(width, height) > _LONGEST_RATIO * min(width, height):
+            raise SceneError(f"the picture is {width} x {height}, which no camera takes")
         return decoded(picture, "the picture", "RGB")
     except CaptureError as error:
         raise SceneError(f"{error.what}: {error.remedy}") from error
