@@ -6,9 +6,11 @@ import importlib
 import pickle
 import re
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
+from conftest import write_tiny_capture
 from source_tree import modules
 
 from handavatar import cli
@@ -254,3 +256,34 @@ def test_every_number_of_every_command_has_a_range(monkeypatch: pytest.MonkeyPat
                     wrong.append(f"{command} {flag}={value}: {outcome!r}")
     assert asked > 200
     assert not wrong, "\n".join(wrong)
+
+
+def test_no_command_prints_what_a_terminal_would_obey() -> None:
+    """Results go through ``say``, all else through ``shown``; what is fixed may be printed."""
+    wrong = []
+    for module, tree in modules().items():
+        if not module.startswith("handavatar.cli") or module == "handavatar.cli.failures":
+            continue
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and ast.unparse(node.func) == "print":
+                said = ast.unparse(node.args[0])
+                if not said.startswith(("shown(", "overview(")) and said not in _FIXED:
+                    wrong.append(f"{module}:{node.lineno}: {said}")
+    assert not wrong, "\n".join(wrong)
+
+
+_FIXED = {
+    "f'handavatar {__version__}'",
+    "f'usage: handavatar bench --table NAME\\n\\nNAME is {known}'",
+    "f'handavatar bench: {found}, expected --table with {known}'",
+    "(out / 'loss.json').read_text()",
+}
+"""Made of this program's own words."""
+
+
+def test_a_folder_s_name_is_shown_and_not_obeyed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_tiny_capture(tmp_path / "a\x1b[31m\u202e", "ab", size=24)
+    assert cli.main(["capture", "check", str(folder)]) == 0
+    assert capsys.readouterr().out.endswith("a\\x1b[31m\\u202e: sound\n")

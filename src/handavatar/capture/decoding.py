@@ -285,7 +285,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
                     "convert it to mp4 (H.264)",
                 )
             stream.codec_context.thread_type = "AUTO"
-            # Of what grows behind its header. Pictures are compressed with some more rows and columns.
+            # Of what grows behind its header. Compressed pictures have some more rows and columns.
             stream.codec_context.options = {"max_pixels": str(MAX_PIXELS * 9 // 8)}
             yield container, stream
 

@@ -13,7 +13,7 @@ from io import TextIOWrapper
 
 from handavatar import __version__
 from handavatar.cli import avatar, bench, capture, default, motion, prior, rig, tracker
-from handavatar.cli.failures import USAGE, WarningsShown, report_failure
+from handavatar.cli.failures import USAGE, WarningsShown, report_failure, shown
 from handavatar.jobs.progress import Progress, shown_progress
 from handavatar.jobs.signals import heard_signals
 
@@ -129,5 +129,5 @@ def _no_such_command(words: list[str]) -> int:
     wanted = " ".join(words[:2] if words[0] in groups else words[:1])
     near = difflib.get_close_matches(wanted, COMMANDS, n=1)
     hint = f"did you mean 'handavatar {near[0]}'?" if near else "handavatar --help lists them all"
-    print(f"handavatar: there is no command '{wanted}'\n{hint}", file=sys.stderr)
+    print(shown(f"handavatar: there is no command '{wanted}'\n{hint}"), file=sys.stderr)
     return USAGE

@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin
 import tyro
 from tyro.constructors import PrimitiveConstructorSpec
 
-from handavatar.cli.failures import shown
+from handavatar.cli.failures import say
 from handavatar.cli.inputs import Expected, require
 from handavatar.errors import ArgumentError, require_range
 
@@ -243,11 +243,11 @@ def print_figures(value: dict[str, Any], indent: int = 0) -> None:
     """Nested results as indented lines for a person."""
     width = max((len(str(name)) for name in value), default=0)
     for name, figure in value.items():
-        label = shown(" " * indent + f"{name:<{width}}")
+        label = " " * indent + f"{name:<{width}}"
         if isinstance(figure, dict):
-            print(label.rstrip())
+            say(label.rstrip())
             print_figures(figure, indent + 2)
         elif isinstance(figure, float):
-            print(f"{label}  {figure:.4g}")
+            say(f"{label}  {figure:.4g}")
         else:
-            print(f"{label}  {'-' if figure is None else shown(str(figure))}")
+            say(f"{label}  {'-' if figure is None else figure}")

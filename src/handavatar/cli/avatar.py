@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from handavatar.cli.failures import say
 from handavatar.errors import ArgumentError
 from handavatar.jobs.progress import Progress
 
@@ -55,7 +56,7 @@ def _train_in_view(
 
 
 def _say_trained(run: Path) -> None:
-    print(f"run: {run}\nnext: handavatar evaluate {run}", flush=True)
+    say(f"run: {run}\nnext: handavatar evaluate {run}")
 
 
 def evaluate(words: list[str], progress: Progress) -> int:
@@ -82,7 +83,7 @@ def edit(words: list[str], progress: Progress) -> int:
     options = parse(EditOptions, words, "edit", ("run",), reads)
     with progress:
         saved = save_edited(options)
-    print(saved)
+    say(saved)
     return 0
 
 
@@ -99,7 +100,7 @@ def render(words: list[str], progress: Progress) -> int:
     with progress:
         folder = render_motion(options, progress)
     if is_first_process():
-        print(folder)
+        say(folder)
     return 0
 
 
@@ -118,7 +119,7 @@ def export(words: list[str], progress: Progress) -> int:
         out = export_avatar(options, progress)
     if options.format == "web":
         print((out / "loss.json").read_text(), end="", file=sys.stderr)
-    print(out)
+    say(out)
     return 0
 
 

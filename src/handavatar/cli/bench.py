@@ -6,8 +6,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from handavatar.cli.failures import USAGE
-from handavatar.errors import printable
+from handavatar.cli.failures import USAGE, say
 from handavatar.jobs.progress import Progress
 
 if TYPE_CHECKING:
@@ -118,7 +117,7 @@ def bench(words: list[str], progress: Progress) -> int:
     if extras["json"]:
         print_json(table.record())
     else:
-        print(printable(table.markdown()))
+        say(table.markdown())
     return 0
 
 

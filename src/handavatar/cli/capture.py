@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from handavatar.cli.failures import BAD_DATA, shown
+from handavatar.cli.failures import BAD_DATA, say, shown
 from handavatar.errors import ArgumentError
 from handavatar.jobs.progress import Progress, shown_progress
 
@@ -72,12 +72,12 @@ def webcam(words: list[str], progress: Progress) -> int:
     recording = _record(options, values)
     if recording is None:
         return 0
-    print(f"recorded: {recording}", flush=True)
+    say(f"recorded: {recording}")
     try:
         with shown_progress("capture webcam", progress.is_silent) as shown:
             _capture_hands(replace(options, file=recording), shown)
     except BaseException:
-        print(f"the recording is kept; handavatar capture video {recording} goes on", flush=True)
+        say(f"the recording is kept; handavatar capture video {recording} goes on")
         raise
     return 0
 
@@ -122,8 +122,8 @@ def _say_captured(options: "VideoOptions") -> None:
     fit = json.loads((options.out / "fit.json").read_text(encoding="utf-8"))
     for line in summary_lines(fit["summary"]):
         print(shown(line))
-    print(f"look at: {options.out / 'overview.png'}")
-    print(f"capture: {options.out}\nnext: handavatar train {options.out}")
+    say(f"look at: {options.out / 'overview.png'}")
+    say(f"capture: {options.out}\nnext: handavatar train {options.out}")
 
 
 def synth(words: list[str], progress: Progress) -> int:
@@ -134,7 +134,7 @@ def synth(words: list[str], progress: Progress) -> int:
     options, extras = parse_with(SynthOptions, (OUT, OVERWRITE), words, "capture synth")
     with progress:
         make_capture(extras["out"], options, extras["overwrite"], progress)
-    print(f"capture: {extras['out']}\nnext: handavatar train {extras['out']}")
+    say(f"capture: {extras['out']}\nnext: handavatar train {extras['out']}")
     return 0
 
 
@@ -154,7 +154,7 @@ def degrade(words: list[str], progress: Progress) -> int:
     )
     with progress:
         degrade_capture(extras["out"], options, extras["overwrite"], progress)
-    print(f"capture: {extras['out']}\nnext: handavatar train {extras['out']}")
+    say(f"capture: {extras['out']}\nnext: handavatar train {extras['out']}")
     return 0
 
 
@@ -167,7 +167,7 @@ def benchmark(words: list[str], progress: Progress) -> int:
     with progress:
         folders = make_benchmark(extras["out"], options, progress)
     for folder in folders:
-        print(f"capture: {folder}")
+        say(f"capture: {folder}")
     return 0
 
 
@@ -198,5 +198,5 @@ def check(words: list[str], progress: Progress) -> int:
     else:
         for problem in problems:
             print(shown(str(problem)))
-        print(f"{options.capture}: {f'{len(problems)} problems' if problems else 'sound'}")
+        say(f"{options.capture}: {f'{len(problems)} problems' if problems else 'sound'}")
     return BAD_DATA if problems else 0

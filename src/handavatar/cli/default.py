@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from handavatar.cli.failures import BAD_DATA
+from handavatar.cli.failures import BAD_DATA, say
 from handavatar.jobs.progress import Progress
 
 
@@ -35,8 +35,8 @@ def doctor(words: list[str], progress: Progress) -> int:
         print_json({"able": is_able, "findings": [vars(finding) for finding in findings]})
     else:
         for finding in findings:
-            print(finding)
-        print(
+            say(finding)
+        say(
             "\nEverything that handavatar demo, train, evaluate and render need is here."
             if is_able
             else "\nSomething is missing that handavatar cannot work without; see above."

@@ -56,6 +56,15 @@ def report_failure(error: BaseException, is_debugging: bool = False) -> int:
     return code
 
 
+def say(text: object) -> None:
+    """A line of results on standard output, in which names of files may stand.
+
+    Args:
+        text: with nothing that is to be shown as a flag.
+    """
+    print(printable(str(text)), flush=True)
+
+
 def with_flags(text: str) -> str:
     """A message of the library as the command line says it: arguments are flags.
 

@@ -1,6 +1,6 @@
 """``handavatar motion``: motions that drive avatars."""
 
-from handavatar.cli.failures import shown
+from handavatar.cli.failures import say, shown
 from handavatar.jobs.progress import Progress
 
 
@@ -18,8 +18,8 @@ def from_source(words: list[str], progress: Progress) -> int:
     write_motion(options.out, motion)
     for note in notes:
         print(shown(f"note: {note}"))
-    print(f"motion: {options.out}, {len(motion)} steps at {motion.fps:.4g} a second")
-    print(f"next: handavatar render RUN --motion {options.out}")
+    say(f"motion: {options.out}, {len(motion)} steps at {motion.fps:.4g} a second")
+    say(f"next: handavatar render RUN --motion {options.out}")
     return 0
 
 
@@ -32,6 +32,6 @@ def to_file(words: list[str], progress: Progress) -> int:
     options = parse(MotionToOptions, words, "motion to", ("source",), {"source": MOTION})
     with progress:
         motion = motion_to(options)
-    print(f"SOMA-X: {options.out}, {len(motion)} steps at {motion.fps:.4g} a second")
-    print("next: SOMAHandLayer.pose(poses, absolute_pose=True, global_translation=transl)")
+    say(f"SOMA-X: {options.out}, {len(motion)} steps at {motion.fps:.4g} a second")
+    say("next: SOMAHandLayer.pose(poses, absolute_pose=True, global_translation=transl)")
     return 0

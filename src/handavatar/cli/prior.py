@@ -1,5 +1,6 @@
 """``handavatar prior``: the occupancy field before it has seen a person."""
 
+from handavatar.cli.failures import say
 from handavatar.jobs.progress import Progress
 
 
@@ -17,12 +18,12 @@ def train(words: list[str], progress: Progress) -> int:
         train_prior(options, progress)
     if not is_first_process():
         return 0
-    print(f"prior: {options.out}")
+    say(f"prior: {options.out}")
     judged = ["--prior", str(options.out)]
     for name in ("rig", "level", "rounds"):
         if getattr(options, name) != getattr(PriorEvaluationOptions, name):
             judged += [f"--{name}", str(getattr(options, name))]
-    print(f"next: handavatar prior evaluate {shlex.join(judged)}")
+    say(f"next: handavatar prior evaluate {shlex.join(judged)}")
     return 0
 
 
@@ -72,5 +73,5 @@ def picture(words: list[str], progress: Progress) -> int:
     with progress:
         paths = picture_priors(options)
     for path in paths:
-        print(path)
+        say(path)
     return 0

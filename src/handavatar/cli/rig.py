@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from handavatar.cli.failures import say
 from handavatar.jobs.progress import Progress
 from handavatar.jobs.signals import is_stopping, unbroken
 
@@ -77,7 +78,7 @@ def import_mano(words: list[str], progress: Progress) -> int:
         return 0
     print_figures(facts)
     reference = model.rig.name if options.out is None else path
-    print(f"\nnext: handavatar capture video FILE --out D --rig {reference}")
+    say(f"\nnext: handavatar capture video FILE --out D --rig {reference}")
     return 0
 
 
@@ -170,5 +171,5 @@ def refine(words: list[str], progress: Progress) -> int:
         print_json({"file": str(out), "figures": figures})
     else:
         print_figures(figures)
-        print(f"skin weights: {out}")
+        say(f"skin weights: {out}")
     return 0

@@ -1,5 +1,6 @@
 """``handavatar tracker``: our own eyes, taught by made pictures."""
 
+from handavatar.cli.failures import say
 from handavatar.jobs.progress import Progress
 
 
@@ -12,8 +13,8 @@ def train(words: list[str], progress: Progress) -> int:
     options = parse(TrackerTrainOptions, words, "tracker train", reads={"start": TRACKER})
     with progress:
         train_made_tracker(options, progress)
-    print(f"tracker: {options.out}")
-    print(f"next: handavatar tracker evaluate --tracker {options.out}")
+    say(f"tracker: {options.out}")
+    say(f"next: handavatar tracker evaluate --tracker {options.out}")
     return 0
 
 
