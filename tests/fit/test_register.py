@@ -129,6 +129,7 @@ def test_what_is_unknown_counts_nothing(rig: Rig, short: Clip) -> None:
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
+@pytest.mark.slow
 def test_a_sequence_follows_its_times(rig: Rig, short: Clip) -> None:
     """Frames far apart are registered as single ones are; landmarks' offsets are none."""
     tracked = spoilt(short.truth, 3.0)
