@@ -94,6 +94,7 @@ def test_pieces_of_rays_do_not_matter(small_avatar: HandAvatar, rendering: Rende
         torch.testing.assert_close(getattr(pieced, name), value, atol=1e-4, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_batch_is_rendered_as_its_hands_are_one_by_one(small_avatar: HandAvatar) -> None:
     poses = [bent_pose(seed) for seed in (1, 2, 3)]
     cameras = [camera_above(size) for size in (16, 24, 20)]

@@ -75,6 +75,7 @@ def test_a_hand_is_followed_and_its_side_told(
             assert error < 0.15 * size
 
 
+@pytest.mark.slow
 def test_walls_have_no_hands() -> None:
     generator = np.random.default_rng(0)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]

@@ -159,6 +159,7 @@ def _with_sightings(hand: ShapedHand, clip: Clip, pixels_off: float) -> list[Obs
     ]
 
 
+@pytest.mark.slow
 def test_landmarks_lead_back_what_outlines_alone_do_not(rig: Rig, short: Clip) -> None:
     hand, tracked = rig.shaped(), spoilt(short.truth, 20.0)
     loose = LOOSE.expand(3, -1, -1)

@@ -78,6 +78,7 @@ def test_a_training_makes_its_pictures_once_and_goes_on(
     assert torch.equal(read_tracker(options.out).network.at_point, second.network.at_point)
 
 
+@pytest.mark.slow
 def test_a_training_that_diverges_keeps_the_last_good_state_and_says_how_to_go_on(
     options: TrackerTrainOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -164,6 +164,7 @@ def test_a_clip_that_cannot_be_learned_is_refused(two_clips: Path, tmp_path: Pat
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_frames_of_a_light_that_the_avatar_lacks_are_not_judged(
     run: Path, two_clips: Path, tmp_path: Path
 ) -> None:
