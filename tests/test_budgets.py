@@ -103,6 +103,8 @@ def test_lists_of_nothing_are_counted_before_they_are_made(tmp_path: Path) -> No
     count = MAX_JSON_CONTAINERS + 1
     (tmp_path / "a.json").write_text('{"a":[' + "[]," * count + "[]]}")
     _refused_soon(lambda: load_json(tmp_path / "a.json"), CaptureError, "lists and objects")
+    (tmp_path / "c.json").write_text('{"a":[' + "0," * 20_000_001 + "0]}")
+    _refused_soon(lambda: load_json(tmp_path / "c.json"), CaptureError, "20000001 values")
     (tmp_path / "b.json").write_text("[" * 1_000_000)
     _refused_soon(lambda: load_json(tmp_path / "b.json"), CaptureError, "not JSON")
 

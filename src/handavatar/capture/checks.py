@@ -20,6 +20,9 @@ MAX_JSON_BYTES = 64 * 2**20
 MAX_JSON_CONTAINERS = 4_000_000
 """Lists and objects: each takes 60 bytes and more, of three in the file. A motion of 100,000 steps
 has 1.7 million, a capture of as many frames 2.5."""
+MAX_JSON_VALUES = 20_000_000
+"""Each takes up to 32 bytes, of two in the file. A motion of 100,000 steps has 5 million, such a
+one of rotation matrices 16."""
 MAX_PIXELS = 64_000_000
 MAX_TEXT = 2000
 PICTURE_FORMATS = {
@@ -76,6 +79,11 @@ def load_json(path: Path, max_bytes: int = MAX_JSON_BYTES) -> dict[str, Any]:
         raise CaptureError(
             f"{path.name} has {containers} lists and objects, at most {MAX_JSON_CONTAINERS} are "
             "read",
+            "split the recording into several captures or motions",
+        )
+    if (commas := text.count(b",")) > MAX_JSON_VALUES:
+        raise CaptureError(
+            f"{path.name} has {commas} values, at most {MAX_JSON_VALUES} are read",
             "split the recording into several captures or motions",
         )
     try:

@@ -3,6 +3,7 @@
 import json
 import os
 import pickle
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -445,3 +446,38 @@ def test_turning_the_wrist_alone_does_not_count_as_bending(
     torch.testing.assert_close(
         matrix_from_axis_angle(torch.tensor(found)), expected, atol=1e-5, rtol=0
     )
+
+
+def _npy(shape: str) -> bytes:
+    """An npy file of eight numbers that says that it has a shape."""
+    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(64)
+
+
+@pytest.mark.parametrize("shape", ["(10000000000, 48)", "(3000000000,)", "(True,)", "(-1,)"])
+def test_arrays_that_say_they_are_vast_are_damaged_files(
+    shape: str, refusal: Any, tmp_path: Path
+) -> None:
+    """Numpy made room for them: "out of memory, ask for fewer pixels"."""
+    (tmp_path / "a.npy").write_bytes(_npy(shape))
+    assert "npy file" in refusal(tmp_path / "a.npy", *ABSOLUTE)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        archive.writestr("poses.npy", _npy(shape))
+    assert "not a whole npz file" in refusal(tmp_path / "a.npz", *ABSOLUTE)
+
+
+def test_small_files_of_very_many_rows_are_refused(refusal: Any, tmp_path: Path) -> None:
+    """Half a megabyte of packed zeros became 15 GB of matrices."""
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, poses=np.zeros((200_001, 48), bool))
+    said = refusal(path, *ABSOLUTE, "--layout", "mano", "--side", "right", "--fps", "30")
+    assert "200,001 rows" in said
+    np.savez_compressed(path, poses=np.zeros(32_000_001, bool))
+    said = refusal(path, *ABSOLUTE, "--layout", "mano", "--side", "right", "--fps", "30")
+    assert "32,000,001 numbers" in said
+
+
+def test_frames_are_numbered_by_plain_digits(refusal: Any, tmp_path: Path) -> None:
+    for name in ("\u00b2", "9" * 5000):
+        (tmp_path / "a.json").write_text(json.dumps({name: {"right": None, "left": None}}))
+        assert refusal(tmp_path / "a.json", "--layout", "interhand", "--fps", "30")

@@ -9,7 +9,7 @@ import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +22,10 @@ _PROGRAMS = (".pt", ".pth", ".pickle", ".joblib")
 MAX_BYTES = 512 * 2**20
 _MAX_FILES = 200_000
 _MAX_DEPTH = 6
+_MOST_ROWS = 200_000
+"""Of frames or hands: 28 minutes at 120 a second."""
+_MOST_NUMBERS = 160 * _MOST_ROWS
+"""Of an array; whole bodies have 156 a row."""
 
 Fields = dict[str, Any]
 
@@ -124,52 +128,69 @@ def _number(path: Path) -> int:
 def _read_npz(path: Path) -> Fields:
     try:
         with zipfile.ZipFile(path) as archive:
-            size = sum(member.file_size for member in archive.infolist())
-        if size > MAX_BYTES:
-            raise CaptureError(
-                f"{path}: unpacks to more than {MAX_BYTES // 2**20} MB",
-                "save the hand's parameters alone",
-            )
-        with np.load(path, allow_pickle=False) as stored:
-            return {name: _unpickled(stored, name, path) for name in stored.files}
+            members = [m for m in archive.infolist() if m.filename.endswith(".npy")]
+            if sum(member.file_size for member in members) > MAX_BYTES:
+                raise CaptureError(
+                    f"{path}: unpacks to more than {MAX_BYTES // 2**20} MB",
+                    "save the hand's parameters alone",
+                )
+            return {
+                member.filename.removesuffix(".npy"): _member(archive, member, path)
+                for member in members
+            }
     except (CaptureError, MemoryError):
         raise
     except Exception as error:  # Of whatever kind: numpy and zipfile stumble in many ways.
         raise CaptureError(f"{path}: not a whole npz file ({error})", "save it again") from error
 
 
-def _unpickled(stored: Any, name: str, path: Path) -> np.ndarray:
-    try:
-        return stored[name]
-    except ValueError as error:
+def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo, path: Path) -> np.ndarray:
+    with archive.open(member) as file:
+        kind = _npy_type(file, member.file_size)
+    if kind.hasobject:
+        name = member.filename.removesuffix(".npy")
         raise CaptureError(
-            f"{path}: {name} cannot be read without running a pickle ({str(error)[:80]})",
+            f"{path}: {name} cannot be read without running a pickle",
             f"save {name} as an array of numbers",
-        ) from error
+        )
+    with archive.open(member) as file:
+        found: np.ndarray = np.lib.format.read_array(file, allow_pickle=False)
+    return found
 
 
 def _read_npy(path: Path) -> Fields:
     with path.open("rb") as file:
         try:
-            kind = _npy_type(file)
+            kind = _npy_type(file, path.stat().st_size)
         except Exception as error:  # Of whatever kind: numpy parses the header as Python.
             raise CaptureError(
                 f"{path}: not an npy file ({str(error)[:80]})", "save it again"
-            ) from (error)
+            ) from error
         if kind.hasobject:
             return _plain_fields(single_object(read_pickle(file.read(), ARRAY_NAMES)))
     try:
         return {"": np.load(path, allow_pickle=False)}
-    except (ValueError, OSError, EOFError) as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # Of whatever kind, as in :func:`_read_npz`.
         raise CaptureError(f"{path}: not a whole npy file ({error})", "save it again") from error
 
 
-def _npy_type(file: BinaryIO) -> np.dtype:
-    """The type of the array that begins here; the file stands behind its header afterwards."""
+def _npy_type(file: Any, size: int) -> np.dtype:
+    """The type of the array that begins here; the file stands behind its header afterwards.
+
+    Raises:
+        ValueError: it is not an npy file, or says that it holds more than it has bytes, for which
+            numpy would make room.
+    """
     version = np.lib.format.read_magic(file)
     if version == (1, 0):
-        return np.lib.format.read_array_header_1_0(file)[2]
-    return np.lib.format.read_array_header_2_0(file)[2]
+        shape, _, kind = np.lib.format.read_array_header_1_0(file)
+    else:
+        shape, _, kind = np.lib.format.read_array_header_2_0(file)
+    if math.prod(shape) * kind.itemsize > size and not kind.hasobject:
+        raise ValueError(f"of shape {shape} and type {kind} in {size} bytes")
+    return kind
 
 
 def _plain_fields(value: Any, depth: int = 0) -> Fields:
@@ -249,6 +270,11 @@ def array_field(fields: Fields, names: tuple[str, ...], path: Path) -> np.ndarra
         raise CaptureError(f"{path}: {name} is no array of numbers", f"save {name} as numbers")
     if not value.size:
         raise CaptureError(f"{path}: {name} is empty", "give at least one frame")
+    if value.size > _MOST_NUMBERS:
+        raise CaptureError(
+            f"{path}: {name} has {value.size:,} numbers, at most {_MOST_NUMBERS:,} are read",
+            "save a part of the recording, and the hand's parameters alone",
+        )
     numbers = value.astype(np.float64)
     if not np.isfinite(numbers).all():
         where = np.argwhere(~np.isfinite(numbers))[0]
@@ -275,6 +301,11 @@ def rows_of(values: np.ndarray, shape: tuple[int, ...], name: str, path: Path) -
         raise CaptureError(
             f"{path}: {name} has shape {values.shape}: it is not told which axis counts the frames",
             f"save one hand, of shape (frames, {', '.join(map(str, shape))})",
+        )
+    if math.prod(leading) > _MOST_ROWS:
+        raise CaptureError(
+            f"{path}: {name} has {math.prod(leading):,} rows, at most {_MOST_ROWS:,} are read",
+            "save a part of the recording",
         )
     return values.reshape(math.prod(leading), *shape)
 
