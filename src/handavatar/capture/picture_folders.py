@@ -192,8 +192,10 @@ def _read(file: Path, size: tuple[int, int]) -> UInt8[np.ndarray, "height width 
         profile = picture.info.get("icc_profile")
         if picture.mode.startswith(("I", "F")):
             # Sixteen bits a pixel.
-            levels = np.asarray(picture, dtype=np.float64) / 257
-            picture = Image.fromarray(levels.round().clip(0, 255).astype(np.uint8))
+            levels = np.array(picture, dtype=np.float32)
+            levels /= 257
+            np.clip(levels.round(out=levels), 0, 255, out=levels)
+            picture = Image.fromarray(levels.astype(np.uint8))
         turn = _TURNS.get(_orientation(opened))
         colored = _srgb(picture if turn is None else picture.transpose(turn), profile)
     except MemoryError:
