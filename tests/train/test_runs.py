@@ -14,8 +14,10 @@ import pytest
 import torch
 
 from handavatar.avatar import CheckpointError
+from handavatar.jobs.files import read_marker
 from handavatar.jobs.finite import NotFinite
 from handavatar.train import runs
+from handavatar.train.live import live_folder, read_live
 from handavatar.train.optimizer_state import (
     optimizer_options,
     optimizer_tensors,
@@ -464,3 +466,30 @@ def test_a_fingerprint_sees_contents_and_names(tmp_path: Path) -> None:
     assert first == folder_sha256(tmp_path, names)
     (tmp_path / "images" / "0.png").rename(tmp_path / "images" / "1.png")
     assert first != folder_sha256(tmp_path, names)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
+def test_a_pipe_where_a_file_should_be_is_not_waited_for(tmp_path: Path) -> None:
+    """An archive may bring one; who opens it waits for one who writes."""
+    run = _new_run(tmp_path / "run")
+    append_log(run, 1, {"psnr": 1.0})
+    checkpoint = save_checkpoint(run, 7, _tensors(7), {"step": 7})
+    live_folder(run).mkdir()
+
+    def piped(path: Path) -> Path:
+        path.unlink(missing_ok=True)
+        os.mkfifo(path)
+        return path
+
+    for read, path, message in (
+        (lambda: run.facts, run.folder / "run.json", "not a plain file"),
+        (lambda: read_log(run), run.log, "not a plain file"),
+        (lambda: load_checkpoint(checkpoint), checkpoint.folder / "MANIFEST.json", "not a plain"),
+    ):
+        piped(path)
+        with pytest.raises((OSError, CheckpointError), match=message):
+            read()
+    piped(live_folder(run) / "progress.json")
+    assert read_live(run) is None
+    piped(run.folder / ".handavatar")
+    assert read_marker(run.folder) is None

@@ -52,7 +52,13 @@ from handavatar.evaluate.report import (
 from handavatar.evaluate.unseen import unseen_figures, unseen_pictures
 from handavatar.fit.register import RegisterOptions
 from handavatar.hand.pose import HandPose
-from handavatar.jobs.files import FolderKind, fill_folder, refuse_folder_in_use, write_atomically
+from handavatar.jobs.files import (
+    FolderKind,
+    fill_folder,
+    read_plain,
+    refuse_folder_in_use,
+    write_atomically,
+)
 from handavatar.jobs.logs import finite_figures, is_step, json_lines
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.video_writer import VideoWriter
@@ -576,7 +582,7 @@ def _curves(run: Path) -> list[Curve]:
         return []
     records = [
         (record["step"], finite_figures(record))
-        for _, record in json_lines(log.read_bytes())
+        for _, record in json_lines(read_plain(log))
         if is_step(record.get("step"))
     ]
     return [

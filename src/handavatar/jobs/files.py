@@ -17,6 +17,7 @@ import logging
 import os
 import shutil
 import socket
+import stat
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -163,13 +164,33 @@ def mark_folder(folder: Path, kind: FolderKind, facts: Mapping[str, Any] | None 
     write_atomically({folder / MARKER: text.encode()})
 
 
+def read_plain(path: Path, most: int = 1 << 30) -> bytes:
+    """All of a plain file.
+
+    Args:
+        path: of the file.
+        most: bytes.
+
+    Raises:
+        OSError: it is missing, larger, or no plain file: into a pipe nobody may ever write.
+    """
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise OSError(errno.EINVAL, "is not a plain file", str(path))
+    if found.st_size > most:
+        raise OSError(
+            errno.EINVAL, f"has {found.st_size} bytes, at most {most} are read", str(path)
+        )
+    return path.read_bytes()
+
+
 def read_marker(folder: Path) -> dict[str, Any] | None:
     """What the marker of a folder says; None if it has none, or one that is not ours."""
     path = folder / MARKER
     try:
-        if path.is_symlink() or path.stat().st_size > _MAX_MARKER_BYTES:
+        if path.is_symlink():
             return None
-        marker = json.loads(path.read_bytes())
+        marker = json.loads(read_plain(path, _MAX_MARKER_BYTES))
     except (OSError, ValueError, RecursionError):
         return None
     if not isinstance(marker, dict) or marker.get("program") != "handavatar":

@@ -27,7 +27,7 @@ from safetensors import SafetensorError
 from handavatar.avatar import HandAvatar
 from handavatar.capture.frames import Frame
 from handavatar.errors import printable
-from handavatar.jobs.files import write_atomically
+from handavatar.jobs.files import read_plain, write_atomically
 from handavatar.jobs.finite import NotFinite
 from handavatar.jobs.processes import is_running
 from handavatar.jobs.progress import Progress
@@ -44,6 +44,10 @@ _MOST_SHARE = 0.01
 """Of the time may go into these copies."""
 _PATIENCE = 30.0
 """Seconds; who has not touched ``watched`` for so long does not look on any more."""
+
+
+_MOST_BYTES = 1 << 20
+"""Of what a trainer says of itself."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +101,7 @@ def live_avatar(run: Run) -> Path:
 def read_live(run: Run) -> LiveState | None:
     """How far a run's training is; None where no trainer has said so."""
     try:
-        content = json.loads((live_folder(run) / "progress.json").read_bytes())
+        content = json.loads(read_plain(live_folder(run) / "progress.json", _MOST_BYTES))
         # A whole number may stand for any.
         for name in ("steps_per_second", "share", "seconds_left", "time"):
             if content.get(name) is not None:

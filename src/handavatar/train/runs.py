@@ -42,6 +42,7 @@ from handavatar.jobs.files import (
     mark_folder,
     put_in_place,
     read_marker,
+    read_plain,
     write_atomically,
 )
 from handavatar.jobs.finite import find_not_finite, require_finite
@@ -59,6 +60,7 @@ _MANIFEST = "MANIFEST.json"
 _STATE = "state.json"
 _STEP_FOLDER = re.compile(r"step-(\d{9,})")
 _FILE_NAME = re.compile(r"[a-z][a-z0-9_]*\.(safetensors|json)")
+_MAX_JSON_BYTES = 64 << 20
 _MAX_MANIFEST_BYTES = 1 << 20
 
 _log = logging.getLogger(__name__)
@@ -308,7 +310,7 @@ def truncate_log(run: Run, step: int) -> None:
 
 def _log_lines(run: Run) -> Iterator[tuple[bytes, Json]]:
     if run.log.exists():
-        for line, record in json_lines(run.log.read_bytes()):
+        for line, record in json_lines(read_plain(run.log)):
             if is_step(record.get("step")):
                 yield line, record
 
@@ -412,8 +414,7 @@ def load_checkpoint(checkpoint: Checkpoint) -> CheckpointContents:
 def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
     path = checkpoint.folder / _MANIFEST
     try:
-        with open(path, "rb") as file:
-            manifest = json.loads(file.read(_MAX_MANIFEST_BYTES))
+        manifest = json.loads(read_plain(path, _MAX_MANIFEST_BYTES))
         files = {
             str(name): (int(entry["size"]), str(entry["sha256"]))
             for name, entry in manifest["files"].items()
@@ -421,6 +422,9 @@ def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
         schema, step = int(manifest["schema"]), int(manifest["step"])
     except FileNotFoundError as error:
         raise _broken(path, "is missing") from error
+    except OSError as error:
+        raise_if_refused(error)
+        raise _broken(path, f"cannot be read ({error.strerror})") from error
     except (
         *(ValueError, KeyError, TypeError, AttributeError),
         *(RecursionError, OverflowError),
@@ -441,7 +445,7 @@ def _verified_payloads(checkpoint: Checkpoint) -> dict[str, bytes]:
             raise _broken(path, f"names a file outside the folder: {name!r}")
         try:
             found = member.stat().st_size
-            data = member.read_bytes() if found == size else b""
+            data = read_plain(member, size) if found == size else b""
         except OSError as error:
             raise_if_refused(error)
             raise _broken(member, f"cannot be read ({error.strerror})") from error
@@ -503,7 +507,7 @@ def read_json(path: Path, remedy: str) -> Json:
         CheckpointError: if the file is missing or holds something else.
     """
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(read_plain(path, _MAX_JSON_BYTES))
     except FileNotFoundError as error:
         raise CheckpointError(f"{path}: is missing\n{remedy}") from error
     except (ValueError, RecursionError) as error:

@@ -284,6 +284,8 @@ class _Curves:
             curves.setdefault(name, _Curve()).add(step, value)
 
     def _read_log(self) -> None:
+        if not self._log.is_file():
+            return
         try:
             with open(self._log, "rb") as file:
                 number = os.fstat(file.fileno()).st_ino
