@@ -253,7 +253,8 @@ def _changed_fields(fields: dict[str, Any], chance: random.Random) -> dict[str, 
                 array.reshape(-1)[: chance.choice((1, 3, array.size))] = chance.choice(numbers)
                 fields[name] = array
             case 7:
-                fields[name] = np.repeat(array[None], chance.choice((2, 300)), 0)
+                times = chance.choice((2, 300))
+                fields[name] = np.repeat(array[None], times if array.size < 10_000 else 1, 0)
     return fields
 
 
