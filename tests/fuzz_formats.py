@@ -530,10 +530,9 @@ def _main() -> None:
     faulthandler.enable()
     torch.set_num_threads(1)
     limit_memory()
-    found = {}
+    found, avatar = {}, avatar_of_the_prior()
     for name in asked.names or FORMATS:
         with tempfile.TemporaryDirectory() as place:
-            avatar = avatar_of_the_prior()
             found[name] = faults_of(name, asked.count, Path(place), avatar, asked.seed)
     print(json.dumps(found))
 
