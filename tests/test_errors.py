@@ -205,6 +205,11 @@ def test_every_command_that_a_message_advises_exists_and_takes_its_flags(
                 if first in NO_COMMANDS or name == "capture of":
                     continue
                 advised.add(name)
+                # "capture video, webcam or synth"
+                listed = re.match(r"(?:, [a-z]+)* or [a-z]+", rest) if first in groups else None
+                for other in re.findall(r"(?:, | or )([a-z]+)", listed[0] if listed else ""):
+                    if f"{first} {other}" not in cli.COMMANDS:
+                        wrong.append(f"{module}, line {line}: {first} {other}")
                 flags = re.findall(r"--([a-z][a-z.-]*)", with_flags(rest))
                 unknown = {f.replace("-", "_") for f in flags} - taken.get(name, set())
                 unknown -= {"help", "version", "quiet", "debug"}

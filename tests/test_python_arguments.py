@@ -1,11 +1,11 @@
 """What a program in Python hands in is refused by name where it enters, with how to put it right."""
 
-import inspect
 import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -20,6 +20,13 @@ from handavatar.geometry.rotations import invert_rigid
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import Rig
 
+
+@pytest.fixture(autouse=True)
+def as_for_a_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the type checks of the tests, which a user's program does not have."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
 EYE = torch.eye(4)
 FLAT = torch.zeros(16, 3)
 FEW = RenderSettings(num_samples=4)
@@ -28,11 +35,6 @@ FEW = RenderSettings(num_samples=4)
 def camera(**changes: Any) -> Camera:
     facts = dict(focal=(80.0, 80.0), center=(8.0, 8.0), width=16, height=16, camera_from_world=EYE)
     return Camera(**{**facts, **changes})
-
-
-def render(avatar: HandAvatar, *given: Any) -> object:
-    """As without the type checks of the tests."""
-    return inspect.unwrap(HandAvatar.render)(avatar, *given)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +127,7 @@ def test_a_picture_is_of_one_hand_and_one_camera(
     given: tuple[Any, ...], says: str, small_avatar: HandAvatar
 ) -> None:
     with pytest.raises(ArgumentError, match=says):
-        render(small_avatar, *given)
+        small_avatar.render(*given)
 
 
 @pytest.mark.parametrize("margin", [6 / 256, math.inf])
@@ -136,7 +138,7 @@ def test_an_inverted_camera_is_named(small_avatar: HandAvatar, margin: float) ->
     placed = EYE.clone()
     placed[:3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
     placed[2, 3] = 0.5
-    seen = camera(camera_from_world=placed)
+    seen = camera(focal=(30.0, 30.0), camera_from_world=placed)
     assert float(small_avatar.render(pose, seen, settings=settings).alpha.max()) > 0.5
     inverted = replace(seen, camera_from_world=invert_rigid(placed))
     with pytest.raises(ArgumentError, match=r"`camera`: nothing of the hand is in(.|\n)*inverse"):
@@ -155,4 +157,4 @@ def test_a_shape_has_as_many_coefficients_as_the_rig(rig: Rig) -> None:
         (torch.zeros(10).double(), "float64, expected .*float32"),
     ):
         with pytest.raises(ArgumentError, match=says):
-            inspect.unwrap(Rig.shaped)(rig, given)
+            rig.shaped(given)
