@@ -127,3 +127,21 @@ def test_a_folder_or_a_link_is_no_file_to_be_replaced(
         refused(words, out, capsys)
         assert contents(place) == before, out
         assert os.readlink(link) == str(place / f"there{ending}")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "edit RUN --out run/avatar.safetensors",
+        "edit run/avatar.safetensors --out run/avatar.safetensors",
+        "motion to motion.json --side right --out motion.json",
+        "motion from motion.json --out motion.json",
+    ],
+)
+def test_what_is_read_is_not_written_over(
+    words: str, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = contents(place)
+    out = Path(words.rpartition(" ")[2])
+    assert "is what is read" in refused(words.partition(" --out")[0], out, capsys)
+    assert contents(place) == before

@@ -14,7 +14,7 @@ from handavatar.capture.checks import CaptureError, decoded, open_picture
 from handavatar.edit import Edit, Paint, bones_named
 from handavatar.errors import ArgumentError, HandAvatarError, require_range, require_ranges
 from handavatar.hand.rig import Rig
-from handavatar.jobs.files import refuse_file_in_use
+from handavatar.jobs.files import files_named, refuse_file_in_use
 
 _log = logging.getLogger(__name__)
 _UNSEEN_COLOR = (0.85, 0.1, 0.75)
@@ -110,7 +110,8 @@ def save_edited(options: EditOptions) -> Path:
         ValueError: what cannot be understood.
     """
     options.check_look()
-    refuse_file_in_use(options.out, options.overwrite)
+    read = (options.run, options.run / "avatar.safetensors", *files_named(options.paint))
+    refuse_file_in_use(options.out, options.overwrite, read)
     avatar = HandAvatar.load(options.run)
     avatar.edit = avatar.edit.then(options.edit_on(avatar))
     avatar.save(options.out)
