@@ -1135,11 +1135,14 @@ def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             f"{path}: not an avatar of schema {SCHEMA}; train it again with this version"
         )
     if found := find_not_finite({**tensors, **about}):
+        again = "train an avatar again"
+        if (path.parent / "run.json").is_file():
+            again = (
+                "train again into its run, from the last checkpoint: "
+                f"handavatar train CAPTURE {argument('out', path.parent)} `resume='auto'`"
+            )
         raise CheckpointError(
-            f"{path}: {found}, expected finite numbers",
-            "",
-            "copy the file again, or train again into its run, from the last checkpoint: "
-            f"handavatar train CAPTURE {argument('out', path.parent)} `resume='auto'`",
+            f"{path}: {found}, expected finite numbers", "", f"copy the file again, or {again}"
         )
     return about, tensors
 

@@ -667,9 +667,11 @@ class UnfinishedFolder:
             return True
         strangers = strangers_in(self.path, self._kind) if is_ours else []
         if not is_ours or strangers:
-            what = f"holds {_listed(strangers)}, which" if strangers else "is in the way, and"
+            what = "is in the way: this program did not leave it there"
+            if strangers:
+                what = f"holds {_listed(strangers)}, which this program did not leave there"
             raise FolderInUse(
-                f"{self.path} {what} this program did not leave there: it stays",
+                f"{self.path} {what}: it stays",
                 "move it away, or name another folder",
             )
         return False
