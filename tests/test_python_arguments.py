@@ -1,4 +1,4 @@
-"""What a program in Python hands in is refused by name where it enters, with how to put it right."""
+"""What a program in Python hands in is refused by name where it enters, with what was expected."""
 
 import math
 from collections.abc import Callable

@@ -33,7 +33,7 @@ from handavatar.train.runs import RUN
 
 def _is_older_demo(folder: Path) -> bool:
     """Whether a version that left no marker has begun a demonstration there."""
-    # Versions that mark runs mark the demonstration, too: this is somebody's folder with a run in it.
+    # Versions that mark runs mark the demonstration, too: else it is a folder with a run in it.
     return read_marker(folder / "run") is None and RUN.is_older(folder / "run")
 
 

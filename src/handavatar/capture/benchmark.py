@@ -18,7 +18,6 @@ from handavatar.jobs.files import FolderKind, claim_folder, make_folder
 from handavatar.jobs.progress import SILENT, Progress
 
 
-
 def _is_older(folder: Path) -> bool:
     """Whether a version that left no marker has made captures there."""
     return any((folder / size / name).is_dir() for size in _SIZES for name in benchmark_names())
