@@ -1,6 +1,6 @@
 """SIGKILL at random moments of what writes; then old or new lies there whole, and never neither.
 
-python scripts/kills.py [--count 200] [--seed 0]
+python scripts/kills.py [--count 200] [--seed 0] [--only PATTERN]
 
 Every command replaces what an earlier one, with other options, has written. It is killed at a
 moment between its start and its usual end; then
@@ -18,21 +18,23 @@ import contextlib
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from conftest import TINY, write_tiny_capture
+from conftest import TINY, coarse_skin, write_tiny_capture
 from stop_anywhere import contents
 
 from handavatar.cli import main
+from handavatar.synthetic.films import FilmOptions, make_film
 from handavatar.train.loop import METHODS, TrainOptions, train
 
 
@@ -95,8 +97,29 @@ def copy(source: Path, target: Path) -> None:
     (shutil.copytree if source.is_dir() else shutil.copy2)(source, target)
 
 
-def jobs(room: Path, capture: Path, avatar: Path) -> list[Job]:
+def small_film(folder: Path) -> Path:
+    """A made video of nine pictures of a hand."""
+    options = FilmOptions("hand", 21, 0.2, ("spread", "relaxed"), width=320, height=240, fps=10.0)
+    with coarse_skin():
+        return make_film(replace(options, seconds=0.9, distance=0.36, crf=12), folder)
+
+
+def jobs(room: Path, capture: Path, avatar: Path, film: Path) -> list[Job]:
     """All commands that replace."""
+    video = ["capture", "video", str(film), "--out", str(room / "video"), "--overwrite"]
+    # Every stage, in few steps.
+    video += [
+        "--tracker",
+        "own",
+        "--fit.landmark-steps",
+        "8",
+        "--fit.outline-steps",
+        "4",
+        "--fit.retry-steps",
+        "1",
+    ]
+    video += ["--register.tilts", "--register.restarts", "0", "--register.texture-rounds", "1"]
+    video += ["--register.texture-sigmas", "3", "--register.no-is-wide"]
     synth = ["capture", "synth", "--size", "32", "--test-frames", "1", "--samples", "2"]
     synth += [
         "--subdivisions",
@@ -115,6 +138,7 @@ def jobs(room: Path, capture: Path, avatar: Path) -> list[Job]:
     edit = ["edit", str(avatar), "--out", str(room / "e.safetensors"), "--overwrite"]
     motion = ["motion", "from", str(capture), "--out", str(room / "m.json"), "--overwrite"]
     found = [
+        Job("video", room / "video", [*video, "--subject", "old"], [*video, "--subject", "new"]),
         Job(
             "synth",
             room / "synth",
@@ -240,14 +264,14 @@ def killed_training(room: Path, capture: Path, count: int, draw: random.Random) 
     return score
 
 
-def kill_all(count: int, seed: int) -> bool:
-    """Kills every command an equal number of times; whether all was right."""
+def kill_all(count: int, seed: int, only: str = "") -> bool:
+    """Kills every command in whose name a pattern is found equally often; whether all was right."""
     draw = random.Random(seed)
     METHODS["quick"] = TINY
     is_right = True
     with tempfile.TemporaryDirectory() as folder:
         top = Path(folder)
-        for name in ("room", "kept", "training"):
+        for name in ("room", "kept", "training", "film"):
             (top / name).mkdir()
         capture = write_tiny_capture(top / "capture")
         with contextlib.redirect_stderr(open(os.devnull, "w")):
@@ -256,15 +280,19 @@ def kill_all(count: int, seed: int) -> bool:
             )
         for name in ("mine.tmp", "mine.unfinished", "mine"):
             (top / "room" / name).write_text(name)
-        todo = jobs(top / "room", capture, trained / "avatar.safetensors")
-        each = -(-count // (len(todo) + 1))
+        todo = jobs(
+            *(top / "room", capture, trained / "avatar.safetensors", small_film(top / "film"))
+        )
+        todo = [job for job in todo if re.search(only, job.name)]
+        each = -(-count // (len(todo) + bool(re.search(only, "train"))))
         for job in todo:
             score = killed(job, each, draw)
             is_right &= not score.wrong
             print(json.dumps({"command": job.name} | vars(score)), flush=True)
-        score = killed_training(top / "training", capture, each, draw)
-        is_right &= not score.wrong
-        print(json.dumps({"command": "train"} | vars(score)), flush=True)
+        if re.search(only, "train"):
+            score = killed_training(top / "training", capture, each, draw)
+            is_right &= not score.wrong
+            print(json.dumps({"command": "train"} | vars(score)), flush=True)
     return is_right
 
 
@@ -272,5 +300,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=200, help="kills, of all commands together")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
+    parser.add_argument("--only", default="", help="commands in whose name this pattern is found")
     options = parser.parse_args()
-    sys.exit(0 if kill_all(options.count, options.seed) else 1)
+    sys.exit(0 if kill_all(options.count, options.seed, options.only) else 1)

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,10 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from handavatar.avatar import HandAvatar
+from handavatar.capture import synthetic as made_captures
 from handavatar.capture.decoding import Sampling, video_frames
 from handavatar.capture.frames import Frame, write_capture
+from handavatar.capture.skin import SkinOptions, paint_skin
 from handavatar.capture.view import view_of
 from handavatar.field.shading import OrientedCues
 from handavatar.geometry.cameras import Camera, look_at
@@ -148,6 +152,18 @@ def tiny_capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_tiny_capture(tmp_path_factory.mktemp("capture") / "tiny")
 
 
+@contextmanager
+def coarse_skin() -> Iterator[None]:
+    """Made hands get a texture of few texels: painting one takes most of a small film's time."""
+
+    def paint(rig: Rig, options: SkinOptions, resolution: int) -> Tensor:
+        return paint_skin(rig, options, min(resolution, 192))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(made_captures, "paint_skin", paint)
+        yield
+
+
 @pytest.fixture(scope="session")
 def film_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A made film of nine small pictures with its truth; read only."""
@@ -155,7 +171,8 @@ def film_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     options = FilmOptions(
         "small", 5, 0.9, ("spread", "relaxed"), sleeved=True, width=128, height=96, seconds=0.6
     )
-    make_film(replace(options, crf=10, personal=0.0), folder)
+    with coarse_skin():
+        make_film(replace(options, crf=10, personal=0.0), folder)
     return folder
 
 
@@ -172,7 +189,8 @@ def hand_film_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "hand", 21, 0.2, ("spread", "relaxed"), width=320, height=240, seconds=0.5, fps=10.0
     )
     folder = tmp_path_factory.mktemp("hand_film")
-    return make_film(replace(options, distance=0.36, crf=12), folder)
+    with coarse_skin():
+        return make_film(replace(options, distance=0.36, crf=12), folder)
 
 
 @pytest.fixture(scope="session")

@@ -2,14 +2,16 @@
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 TOP = Path(__file__).parents[1]
 SOURCE = TOP / "src" / "handavatar"
 
 
+@cache
 def modules() -> dict[str, ast.Module]:
-    """Dotted name to syntax tree of every module of the package."""
+    """Dotted name to syntax tree of every module of the package; read only."""
     found = {}
     for path in sorted(SOURCE.rglob("*.py")):
         parts = path.relative_to(SOURCE.parent).with_suffix("").parts

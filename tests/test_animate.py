@@ -287,6 +287,7 @@ def test_the_error_of_every_frame_is_stated_on_request(
     assert not (tmp_path / "near" / "errors").exists()
 
 
+@pytest.mark.slow
 def test_what_coarse_samples_miss_is_found_out(small_avatar: HandAvatar) -> None:
     camera = camera_above(32)
     settings = RenderSettings(mask_margin=2 / 32)

@@ -94,6 +94,7 @@ def test_pieces_of_rays_do_not_matter(small_avatar: HandAvatar, rendering: Rende
         torch.testing.assert_close(getattr(pieced, name), value, atol=1e-4, rtol=0)
 
 
+@pytest.mark.slow
 def test_a_batch_is_rendered_as_its_hands_are_one_by_one(small_avatar: HandAvatar) -> None:
     poses = [bent_pose(seed) for seed in (1, 2, 3)]
     cameras = [camera_above(size) for size in (16, 24, 20)]
@@ -132,6 +133,7 @@ def test_a_later_state_is_read_as_a_file_is(small_avatar: HandAvatar, tmp_path: 
         small_avatar.reloaded(tmp_path / "two.safetensors")
 
 
+@pytest.mark.slow
 def test_in_a_batch_a_pose_is_prepared_once(
     small_avatar: HandAvatar, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -237,6 +239,7 @@ def test_traced_shadows_do_not_swim_when_only_the_camera_moves(small_avatar: Han
     assert float(light.amax() - light.amin()) < 0.01 * float(everywhere.amax() - everywhere.amin())
 
 
+@pytest.mark.slow
 def test_lifting_a_finger_lights_what_it_shaded(small_avatar: HandAvatar) -> None:
     avatar = _avatar_with(small_avatar, TracedCues(60))
     pose = HandPose(gesture_rotations(small_avatar.base_rig, "fist"), torch.zeros(3))
@@ -638,6 +641,7 @@ def test_detail_is_saved_and_read_back(small_avatar: HandAvatar, tmp_path: Path)
     assert detailed.reloaded(tmp_path / "plain.safetensors").texture is None
 
 
+@pytest.mark.slow
 def test_an_avatar_of_two_clips_is_shown_in_either_light(
     two_lights: HandAvatar, tmp_path: Path
 ) -> None:

@@ -281,7 +281,7 @@ def test_every_number_of_every_command_has_a_range(monkeypatch: pytest.MonkeyPat
         table = command.split()[1:] if command.startswith("bench") else []
         for name, kind in numbers.items():
             flag = f"--{name.replace('_', '-')}"
-            for value in ("-1", f"1{30 * '0'}", *(["nan", "inf", "-inf"] if kind is float else [])):
+            for value in ("-1", *(["nan", "inf"] if kind is float else [f"1{30 * '0'}"])):
                 asked += 1
                 words = [*table, *needed, f"{flag}={value}"]
                 outcome = _outcome(command, words, monkeypatch)

@@ -165,6 +165,7 @@ def test_files_for_other_programs_are_whole(saved: Path, tmp_path: Path) -> None
     assert f"reaches {100 * reach:.1f} cm" in told
 
 
+@pytest.mark.slow
 def test_without_an_avatar_they_say_who_makes_one(tmp_path: Path) -> None:
     done = _run([str(EXAMPLES / "03_edit.py")], tmp_path)
     assert done.returncode == 1

@@ -80,6 +80,7 @@ def test_import_capture_train_save_load_render(
         assert captured.out == "" and "handavatar rig import-mano" in captured.err
 
 
+@pytest.mark.slow
 def test_a_prior_learns_on_it_is_judged_and_pictured(
     home: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

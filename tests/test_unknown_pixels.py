@@ -142,6 +142,7 @@ def test_scribbles_change_nothing(consumer: Callable[[list[Frame]], list[Tensor]
         assert torch.equal(before, after)
 
 
+@pytest.mark.slow
 def test_scribbles_would_change_it_if_they_were_known() -> None:
     """The law is no tautology: with everything known the same scribbles do change results."""
     everything = torch.ones(SIZE, SIZE, dtype=torch.bool)
@@ -162,6 +163,7 @@ def test_scribbles_would_change_it_if_they_were_known() -> None:
         assert not all(a.shape == b.shape and torch.equal(a, b) for a, b in pairs), consumer
 
 
+@pytest.mark.slow
 def test_scribbles_change_neither_losses_nor_gradients_of_a_joint_step(tmp_path: object) -> None:
     folder = tmp_path / "capture"  # type: ignore[operator]
     rig = load_open_hand()

@@ -62,6 +62,7 @@ def _contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
+@pytest.mark.slow
 def test_the_same_bits_every_time(tmp_path: Path, tiny_size: None) -> None:
     options = BenchmarkOptions(only=("dark-key-pose5",))
     made = [make_benchmark(tmp_path / place, options) for place in ("first", "second")]
@@ -72,6 +73,7 @@ def test_the_same_bits_every_time(tmp_path: Path, tiny_size: None) -> None:
             assert content == after[name], f"{first.name}/{name}"
 
 
+@pytest.mark.slow
 def test_what_is_there_is_not_made_again(tmp_path: Path, tiny_size: None) -> None:
     told = Told()
     options = BenchmarkOptions(only=("light-colored-direct", "light-key-pose5"))

@@ -83,6 +83,7 @@ def test_a_folder_in_use_stays_as_it_is(tiny_capture: Path, tmp_path: Path) -> N
     assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
+@pytest.mark.slow
 def test_noise_may_last(tmp_path: Path) -> None:
     source = write_tiny_capture(tmp_path / "source", "a" * 50)
     frames = read_capture(source)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from conftest import coarse_skin
 from videos import CASES, needs_cases
 
 from handavatar.capture.decoding import Sampling, VideoFrame, video_frames
@@ -28,7 +29,8 @@ def _placed(crop: np.ndarray, right: int, down: int) -> np.ndarray:
 def scenes() -> list[tuple[np.ndarray, np.ndarray]]:
     """Pictures of hands with the fingers up and in the picture, and where their landmarks are."""
     rig = load_rig("open-hand")
-    made = make_crops(rig, TrackedPoints.of(rig, 64), 40, 11)
+    with coarse_skin():
+        made = make_crops(rig, TrackedPoints.of(rig, 64), 40, 11)
     found = []
     for image, points, is_hand in zip(made.images, made.points, made.is_hand, strict=True):
         places = points[:NUM_LANDMARKS, :2]
@@ -73,6 +75,7 @@ def test_a_hand_is_followed_and_its_side_told(
             assert error < 0.15 * size
 
 
+@pytest.mark.slow
 def test_walls_have_no_hands() -> None:
     generator = np.random.default_rng(0)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]

@@ -11,6 +11,7 @@ CHOICE = "from handavatar.capture.pathtracer import choose_variant; print(choose
 ABORTING = [*Path("/usr/lib").glob("*/libLLVM-15.so*"), *Path("/usr/lib").glob("*/libLLVM-16.so*")]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not ABORTING, reason="there is no libLLVM 15 or 16 here")
 def test_a_library_that_aborts_in_a_real_kernel_is_not_chosen(
     monkeypatch: pytest.MonkeyPatch,

@@ -143,6 +143,7 @@ def test_a_hand_wholly_in_the_picture_is_kept_and_known(
     assert len(counts) == rig.num_vertices and int(counts.max()) == _MADE
 
 
+@pytest.mark.slow
 def test_a_hand_that_leaves_the_picture_is_rejected_by_that_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -169,6 +170,7 @@ def test_a_hand_that_leaves_the_picture_is_rejected_by_that_name(
         assert bool((frame.image[:, beyond] == 128).all())
 
 
+@pytest.mark.slow
 def test_pictures_are_stored_as_large_as_the_video_shows_the_hand(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

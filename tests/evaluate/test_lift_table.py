@@ -35,6 +35,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return make_capture(tmp_path_factory.mktemp("lift") / "made", TINY)
 
 
+@pytest.mark.slow
 def test_without_a_finger_its_skin_is_gone_and_what_it_shaded_is_brighter(
     capture: Capture,
 ) -> None:

@@ -171,6 +171,7 @@ def test_the_start_stays_where_colours_agree_no_better(avatar: HandAvatar) -> No
     assert distance(avatar, found, true) < 3e-4
 
 
+@pytest.mark.slow
 def test_without_a_rendering_the_avatar_makes_one(avatar: HandAvatar) -> None:
     true = bent_pose(1)
     frame = photograph(avatar, true)

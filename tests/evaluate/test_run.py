@@ -169,6 +169,7 @@ def test_a_folder_of_something_else_is_not_written_into(
     assert [path.read_text() for path in tmp_path.iterdir()] == ["a holiday"]
 
 
+@pytest.mark.slow
 def test_truth_is_compared_where_the_capture_has_it(
     avatar_file: Path, tiny_capture: Path, tmp_path: Path
 ) -> None:
@@ -185,6 +186,7 @@ def test_truth_is_compared_where_the_capture_has_it(
     assert abs(metrics["truth"]["shading_correlation"]) < 0.5  # Of noise with anything.
 
 
+@pytest.mark.slow
 def test_tracked_poses_are_fitted_to_masks_and_known_ones_are_not(
     avatar_file: Path, tiny_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -224,6 +226,7 @@ def test_tracked_poses_are_fitted_to_masks_and_known_ones_are_not(
     assert not (tmp_path / "known" / "own_motion.mp4").exists()
 
 
+@pytest.mark.slow
 def test_registered_poses_are_judged_apart(
     avatar_file: Path, tiny_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -259,6 +262,7 @@ def _scribbled(folder: Path, seed: int) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_what_stands_in_unknown_pixels_changes_no_figure(avatar_file: Path, tmp_path: Path) -> None:
     found = []
     for seed in (0, 1):
@@ -317,6 +321,7 @@ def test_dropped_frames_are_counted_as_far_as_the_capture_tells(
     assert (found["split"], found["capture"]) == expected
 
 
+@pytest.mark.slow
 def test_a_capture_without_training_frames_has_no_baseline(
     avatar_file: Path, tmp_path: Path
 ) -> None:
@@ -344,6 +349,7 @@ def test_what_cannot_be_judged_is_refused(
         evaluate_run(EvaluateOptions(tmp_path, tiny_capture))
 
 
+@pytest.mark.slow
 def test_a_run_folder_names_its_capture_and_shows_its_curves(
     avatar_file: Path, tiny_capture: Path, tmp_path: Path
 ) -> None:
@@ -359,6 +365,7 @@ def test_a_run_folder_names_its_capture_and_shows_its_curves(
     assert "psnr, mean of 20 steps" in report
 
 
+@pytest.mark.slow
 def test_large_pictures_are_judged_binned_unless_asked_for_whole(
     avatar_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -55,6 +55,7 @@ def test_the_ways_are_timed_on_the_same_pictures(options: SpeedTableOptions) -> 
     assert isinstance(memory, int) and 100 < memory < 2000
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process's own peak")
 def test_the_memory_of_whoever_started_a_process_is_not_its_own() -> None:
     torch.ones(150_000_000).sum()  # 600 MB, given back

@@ -130,6 +130,7 @@ def test_light_that_is_baked_multiplies_the_colours(
     assert not baked_textures(small_avatar, hand, Edit(), 32, True, light_poses=1).occlusion
 
 
+@pytest.mark.slow
 def test_the_light_of_a_pose_is_what_its_picture_shows(
     small_avatar: HandAvatar, hand: ShapedHand
 ) -> None:
@@ -160,6 +161,7 @@ def test_the_occlusion_is_a_grey_picture_of_half_the_size(
     assert grey.max() == 255 and grey.min() < 200
 
 
+@pytest.mark.slow
 @torch.no_grad()
 def test_an_atlas_carries_the_same_colours_as_the_vertices(tmp_path: Path) -> None:
     mano = read_mano(write_mano(tmp_path / "MANO_RIGHT.pkl")).rig

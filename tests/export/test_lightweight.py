@@ -194,6 +194,7 @@ def test_lifted_bones_hide_nothing() -> None:
     assert torch.equal(found[1, :, :, 4:], occlusion[1, :, :, 4:])
 
 
+@pytest.mark.slow
 def test_a_lightweight_hand_repeats_and_knows_its_loss(
     small_avatar: HandAvatar, light: LightweightHand
 ) -> None:

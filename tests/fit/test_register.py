@@ -129,6 +129,7 @@ def test_what_is_unknown_counts_nothing(rig: Rig, short: Clip) -> None:
     assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
+@pytest.mark.slow
 def test_a_sequence_follows_its_times(rig: Rig, short: Clip) -> None:
     """Frames far apart are registered as single ones are; landmarks' offsets are none."""
     tracked = spoilt(short.truth, 3.0)
@@ -158,6 +159,7 @@ def _with_sightings(hand: ShapedHand, clip: Clip, pixels_off: float) -> list[Obs
     ]
 
 
+@pytest.mark.slow
 def test_landmarks_lead_back_what_outlines_alone_do_not(rig: Rig, short: Clip) -> None:
     hand, tracked = rig.shaped(), spoilt(short.truth, 20.0)
     loose = LOOSE.expand(3, -1, -1)

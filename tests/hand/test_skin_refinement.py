@@ -79,6 +79,7 @@ def test_vertices_on_the_coarse_surface_are_at_no_distance() -> None:
     assert float(surface_loss(middles, truth, rig.faces)) < 3e-8
 
 
+@pytest.mark.slow
 def test_surface_distance_is_unsquared_and_its_gradient_is_exact() -> None:
     rig = load_open_hand("778")
     truth = rig.template_vertices[:, None].double()

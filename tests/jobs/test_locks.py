@@ -74,6 +74,7 @@ def test_on_a_system_without_locks_work_goes_on_with_a_warning(
     assert "this system has no locks" in caplog.text
 
 
+@pytest.mark.slow
 def test_the_package_imports_where_there_is_no_fcntl() -> None:
     code = (
         "import sys, warnings; sys.modules['fcntl'] = None; warnings.simplefilter('ignore')\n"

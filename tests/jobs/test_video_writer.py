@@ -7,6 +7,7 @@ from pathlib import Path
 
 import av
 import numpy as np
+import pytest
 
 from handavatar.capture.decoding import Sampling, video_frames
 from handavatar.jobs.video_writer import VideoWriter
@@ -42,6 +43,7 @@ def test_the_same_pictures_give_the_same_film(tmp_path: Path) -> None:
     assert first == _write(tmp_path / "b.mp4").read_bytes()
 
 
+@pytest.mark.slow
 def test_another_process_on_one_core_writes_the_same_film_at_another_time(tmp_path: Path) -> None:
     first = _write(tmp_path / "a.mp4").read_bytes()
     program = (

@@ -1,11 +1,14 @@
 """The tracker's training as a command: pictures on disk, going on, what is refused."""
 
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from math import inf
 from pathlib import Path
 
 import pytest
 import torch
+from conftest import coarse_skin
 from safetensors.torch import load_file, save_file
 from told import Told
 
@@ -15,15 +18,18 @@ from handavatar.jobs.finite import NotFinite, find_not_finite
 from handavatar.synthetic import lessons
 from handavatar.synthetic.lessons import TrackerTrainOptions, train_made_tracker
 from handavatar.tracker.model import TrackerError, read_tracker
-from handavatar.tracker.training import CropBatch, TrackerTraining
+from handavatar.tracker.training import CropBatch, TrackerOptions, TrackerTraining
 
 
 @pytest.fixture
-def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TrackerTrainOptions:
-    monkeypatch.setattr(lessons, "IN_A_FILE", 70)
-    return TrackerTrainOptions(
-        tmp_path / "t.safetensors", tmp_path / "pictures", count=70, steps=4, processes=1
-    )
+def options(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[TrackerTrainOptions]:
+    """Of ten pictures and lessons of eight."""
+    monkeypatch.setattr(lessons, "IN_A_FILE", 10)
+    monkeypatch.setattr(lessons, "TrackerOptions", partial(TrackerOptions, batch=8))
+    with coarse_skin():
+        yield TrackerTrainOptions(
+            tmp_path / "t.safetensors", tmp_path / "pictures", count=10, steps=4, processes=1
+        )
 
 
 def test_a_training_makes_its_pictures_once_and_goes_on(
@@ -72,6 +78,7 @@ def test_a_training_makes_its_pictures_once_and_goes_on(
     assert torch.equal(read_tracker(options.out).network.at_point, second.network.at_point)
 
 
+@pytest.mark.slow
 def test_a_training_that_diverges_keeps_the_last_good_state_and_says_how_to_go_on(
     options: TrackerTrainOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -104,6 +104,7 @@ def test_points_and_mask_go_where_the_picture_goes() -> None:
         assert bool((near == 1).any())
 
 
+@pytest.mark.slow
 def test_teaching_goes_on_where_it_ended() -> None:
     lessons = [dotted(8, seed) for seed in range(6)]
 
@@ -126,6 +127,7 @@ def test_teaching_goes_on_where_it_ended() -> None:
         assert torch.equal(value, second.state_dict()[name]), name
 
 
+@pytest.mark.slow
 def test_a_network_learns_where_a_dot_is() -> None:
     torch.manual_seed(0)
     # Pictures stay nearly as they are.
@@ -228,6 +230,7 @@ def test_measures_know_an_oracle(rig: Rig) -> None:
     assert moved.place_coverage == pytest.approx(22 / 48)
 
 
+@pytest.mark.slow
 def test_the_shipped_tracker_sees_hands_that_it_was_not_taught_with() -> None:
     rig = load_open_hand()
     tracker = shipped_tracker()

@@ -98,6 +98,7 @@ def _errors(avatar: HandAvatar, folder: Path) -> tuple[float, float]:
     return float(torch.cat(colors).square().mean()), float(error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "cues",
     [OrientedCues(), pytest.param(TracedCues(28), marks=pytest.mark.slow)],
@@ -114,6 +115,7 @@ def test_clips_are_nearer_with_a_light_each_than_with_one_for_all(
     assert albedo_of_one > 1.5 * albedo
 
 
+@pytest.mark.slow
 def test_an_avatar_of_two_clips_is_trained_kept_and_judged(run: Path, two_clips: Path) -> None:
     avatar, capture = HandAvatar.load(run), read_capture(two_clips)
     assert avatar.num_lights == 2 and avatar.texture is not None
@@ -162,6 +164,7 @@ def test_a_clip_that_cannot_be_learned_is_refused(two_clips: Path, tmp_path: Pat
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_frames_of_a_light_that_the_avatar_lacks_are_not_judged(
     run: Path, two_clips: Path, tmp_path: Path
 ) -> None:

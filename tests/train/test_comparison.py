@@ -200,6 +200,7 @@ def test_impossible_comparisons_are_refused(tmp_path: Path) -> None:
 # --- bench --table geometry -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_table_has_a_row_per_decoder_and_says_what_it_rests_on(tmp_path: Path) -> None:
     wanted = {"decoders": ("pair", "coap"), "guides": (1,)} | {
         "steps": 2,

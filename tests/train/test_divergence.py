@@ -551,6 +551,7 @@ def _assert_good_checkpoints(run: Path) -> None:
         assert find_not_finite(load_file(file)) is None, file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [pytest.param(name, marks=() if name in FAST else pytest.mark.slow) for name in INJECTIONS],

@@ -192,6 +192,7 @@ def test_a_spoilt_report_is_none(run: Run, content: str) -> None:
     assert read_live(run) is None
 
 
+@pytest.mark.slow
 def test_a_disk_that_refuses_is_told_of_and_training_goes_on(
     tiny_capture: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], eager: None
 ) -> None:

@@ -90,6 +90,7 @@ def _assert_same_end(run: Path, whole_run: Path) -> None:
 # --- what training does ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_loss_of_a_patch_seen_again_and_again_falls(tiny_capture: Path) -> None:
     capture = read_capture(tiny_capture)
     frame = capture.frame(0)
@@ -126,6 +127,7 @@ def test_a_step_changes_all_but_the_frozen_encoder(tiny_capture: Path) -> None:
         assert any(name.startswith(part) for name in changed), part
 
 
+@pytest.mark.slow
 def test_warm_steps_leave_the_occupancy_alone(whole_run: Path) -> None:
     warm, joint = (
         load_checkpoint(Checkpoint(whole_run / "checkpoints" / f"step-{step:09d}", step)).tensors
@@ -173,6 +175,7 @@ def test_the_run_folder_holds_everything(whole_run: Path, tiny_capture: Path) ->
     assert {"camera_from_world", "rotations", "translation"} == info["view"].keys()
 
 
+@pytest.mark.slow
 def test_several_threads_give_the_same_bytes_every_time(tiny_capture: Path, tmp_path: Path) -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
@@ -195,6 +198,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(
     assert first == second != third
 
 
+@pytest.mark.slow
 def test_tracked_poses_are_corrected_and_known_ones_are_not(
     tiny_capture: Path, whole_run: Path, tmp_path: Path
 ) -> None:
@@ -225,6 +229,7 @@ def test_the_papers_method_takes_tracked_poses_as_they_are(tmp_path: Path) -> No
     assert (method.frames * method.patches, method.patch_size, method.num_samples) == (16, 32, 64)
 
 
+@pytest.mark.slow
 def test_detail_is_learned_last_and_begun_anew_by_whoever_was_stopped_in_it(
     tiny_capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -365,6 +370,7 @@ _WITH_LIGHT = (("samples", 2), ("sky", 1), ("tracing light", 3))
 _STEPS_AND_DETAIL = (("train", 1), ("train", 5), ("views", 2), ("unwrapping", 1), ("detail", 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("confidence", "cues", "places"),
     [
@@ -437,6 +443,7 @@ def test_a_finished_run_is_not_trained_again(
         train(replace(_options(tiny_capture, run), resume="never"))
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_is_gone_on_with_beside_a_finished_one_of_a_later_date(
     tiny_capture: Path, whole_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -552,6 +559,7 @@ def test_a_run_of_another_seed_is_not_continued(tiny_capture: Path, tmp_path: Pa
         train(replace(options, steps=0))
 
 
+@pytest.mark.slow
 def test_large_pictures_are_binned_for_all_but_the_detail(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

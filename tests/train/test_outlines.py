@@ -53,6 +53,7 @@ def _mean_iou(avatar: HandAvatar, poses: list[HandPose], frames: list[Frame]) ->
     return sum(overlaps) / len(overlaps)
 
 
+@pytest.mark.slow
 def test_the_shape_grows_into_larger_masks() -> None:
     avatar, frames = _avatar(), _frames(1.05, 0.0)
     poses = [frame.pose for frame in frames]

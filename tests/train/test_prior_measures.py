@@ -20,6 +20,7 @@ from handavatar.train.prior_measures import (
 )
 
 
+@pytest.mark.slow
 def test_a_prior_gets_a_row_per_hand_that_json_can_hold() -> None:
     prior = PairOccupancy()
     load_prior(prior)

@@ -100,6 +100,7 @@ def test_directions_gather_where_the_sky_is_bright() -> None:
     assert float(near.min()) > 0.7
 
 
+@pytest.mark.slow
 def test_relit_samples_are_those_that_would_be_found(tiny_capture: Path) -> None:
     capture = read_capture(tiny_capture)
     frames = [capture.frame(index) for index in capture.split("train")]

@@ -212,6 +212,7 @@ def test_a_few_pictures_at_a_time_are_taken(server: ViewServer) -> None:
     assert status == 200
 
 
+@pytest.mark.slow
 def test_a_thousand_spoilt_pictures_are_read_or_refused(
     server: ViewServer, capfd: pytest.CaptureFixture[str]
 ) -> None:

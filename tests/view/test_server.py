@@ -290,6 +290,7 @@ def test_bodies_that_are_too_long_or_of_no_length_are_not_read(server: ViewServe
     assert_alive(server)
 
 
+@pytest.mark.slow
 def test_fifty_clients_at_once_each_see_their_own(server: ViewServer) -> None:
     alone = [picture(server, "one", n + 1, orbit={"azimuth": 7 * n}) for n in range(50)]
 
@@ -407,6 +408,7 @@ def test_a_failure_of_ours_is_told_and_the_server_goes_on(
     assert_alive(server)
 
 
+@pytest.mark.slow
 def test_the_command_serves_tries_the_next_port_and_ends(
     small_avatar: HandAvatar, tmp_path: Path
 ) -> None:

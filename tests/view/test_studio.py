@@ -95,6 +95,7 @@ def test_the_last_stage_is_what_render_gives_to_the_bit(
     assert np.array_equal(studio.refined(scene, "full", never), pass_pictures(rendering)["rgb"])
 
 
+@pytest.mark.slow
 def test_the_avatars_own_edit_is_where_pages_begin_and_can_be_taken_back(
     small_avatar: HandAvatar,
 ) -> None:
@@ -339,6 +340,7 @@ def test_nothing_is_left_where_saving_fails(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_page_chooses_among_lights_and_each_has_its_own_view(
     two_lights: HandAvatar, studio: Studio, tmp_path: Path
 ) -> None:

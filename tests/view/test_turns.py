@@ -133,6 +133,7 @@ def test_what_is_remembered_of_clients_is_bounded(turns: Turns) -> None:
     assert len(turns._newest) <= 1024
 
 
+@pytest.mark.slow
 def test_lanes_that_must_keep_to_a_share_rest_in_their_work_and_between() -> None:
     turns = Turns({"field": nothing}, share=Share(0.2))
     begin, own = time.monotonic(), time.process_time()

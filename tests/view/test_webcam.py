@@ -321,6 +321,7 @@ def started(*words: str) -> subprocess.Popen[str]:
     )
 
 
+@pytest.mark.slow
 def test_interrupted_the_command_leaves_nothing(tmp_path: Path) -> None:
     process = started("--out", str(tmp_path / "mine"))
     try:

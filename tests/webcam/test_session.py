@@ -73,6 +73,7 @@ def test_a_mirrored_hand_is_a_left_one_in_the_mirrored_places(
         assert float(turns.norm()) < 0.25
 
 
+@pytest.mark.slow
 def test_what_is_wrong_with_a_picture_is_said(
     hand_film: FilmTruth, hand_pictures: list[np.ndarray]
 ) -> None:
@@ -89,6 +90,7 @@ def test_what_is_wrong_with_a_picture_is_said(
     assert kinds(settled([image, blurred]))[1] == {"blur"}
 
 
+@pytest.mark.slow
 def test_a_hand_that_is_cut_off_or_small_is_said(hand_pictures: list[np.ndarray]) -> None:
     image = hand_pictures[0]
     height, width = image.shape[:2]

@@ -6,7 +6,7 @@ independent observations it stands for, however many points it is evaluated at.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -138,6 +138,16 @@ class HandPoints:
     def num_shared(self) -> int:
         """Unknowns that all frames share: of the shape, and of the landmarks' offsets."""
         return max(self.space.directions.shape[-1], self.landmarks.directions.shape[-1])
+
+    def with_shared_fixed(self) -> "HandPoints":
+        """The same hand without shared unknowns: a pose alone costs a tenth of all together."""
+        space = ShapeSpace(
+            self.space.directions[..., :0],
+            self.space.joint_directions[..., :0],
+            self.space.sigmas[:0],
+        )
+        landmarks = replace(self.landmarks, directions=self.landmarks.directions[..., :0])
+        return replace(self, space=space, landmarks=landmarks)
 
 
 def linearise_frame(

@@ -196,14 +196,22 @@ def _register(
     skin = sightings[0].vertices if has_landmarks else None
     num_shapes = len(space.sigmas)
 
+    last: tuple[Tensor, HandPoints] | None = None
+
     def points_of(shared: Float[Tensor, "shared"], frame: int) -> HandPoints:
+        nonlocal last
+        if last is not None and last[0] is shared:
+            return last[1]
         shaped = space.shaped(hands[frame if len(hands) > 1 else 0], shared[:num_shapes])
         landmarks = (
             landmark_rest(shaped, space, shared[num_shapes:], skin)
             if has_landmarks
             else _NO_LANDMARKS
         )
-        return HandPoints(shaped, space, surface, balls, landmarks)
+        points = HandPoints(shaped, space, surface, balls, landmarks)
+        if len(hands) == 1:  # The same for all frames.
+            last = shared, points
+        return points
 
     # The frames share their errors (one rig, one way to cut out hands): shape has to be worth it.
     space_sigmas = space.sigmas / max(1.0, _SHARED_ERRORS * len(observations)) ** 0.5

@@ -15,7 +15,6 @@ from handavatar.fit.appearance import SeenTexture, SkinTexture, see_texture
 from handavatar.fit.energy import (
     EnergyOptions,
     HandPoints,
-    Linearised,
     Observation,
     linearise_frame,
 )
@@ -136,14 +135,14 @@ class Descent:
 
     def energies(self, look: Look) -> Float[Tensor, "frames"]:
         """Of each frame, priors included."""
-        return self._linearised(look, self.poses, self.shared).energies
+        return self._linearised(look, self.poses).energies
 
     def judge(self, look: Look) -> tuple[Float[Tensor, "frames"], Float[Tensor, "frames 51 51"]]:
         """Energies, and covariances of the poses' errors as the curvature of the energy says.
 
         For these, neighbours in time are held still.
         """
-        here = self._linearised(look, self.poses, self.shared)
+        here = self._linearised(look, self.poses)
         return here.energies, torch.linalg.inv(here.pose_blocks().double()).float()
 
     def tracked_information(self) -> Float[Tensor, "frames 51 51"]:
@@ -157,11 +156,11 @@ class Descent:
 
     def step_poses(self, look: Look, steps: int) -> None:
         """Descends in the poses; every frame keeps what is best for it."""
-        here = self._linearised(look, self.poses, self.shared)
+        here = self._linearised(look, self.poses)
         for _ in range(steps):
             change = here.solve(self.damping)
             candidate = moved_pose(self.poses, change)
-            there = self._linearised(look, candidate, self.shared)
+            there = self._linearised(look, candidate)
             is_better = there.energies < here.energies
             self._damp(is_better)
             self.poses = _merged(is_better, candidate, self.poses)
@@ -198,14 +197,20 @@ class Descent:
         factor = torch.where(is_better, _FURTHER, _BACK)
         self.damping = (self.damping * factor).clamp(_LEAST_DAMPING, _MOST_DAMPING)
 
-    def _linearised_frames(
-        self, look: Look, poses: HandPose, shared: Float[Tensor, "shared"]
-    ) -> list[Linearised]:
-        """What each frame's own observations say."""
+    def _linearised(
+        self, look: Look, poses: HandPose, shared: Float[Tensor, "shared"] | None = None
+    ) -> "_Whole":
+        """What all frames say at some poses; of the shared unknowns' slopes only if these move."""
+        count = len(self.observations)
+        size = NUM_UNKNOWNS + (0 if shared is None else len(shared))
+        # Each frame's matrix goes to its place at once: they are the most that is held here.
+        hessian, gradient = torch.zeros(count, size, size), torch.zeros(count, size)
+        energies = torch.zeros(count)
 
-        def linearised(frame: int) -> Linearised:
-            return linearise_frame(
-                self.points_of(shared, frame),
+        def linearise(frame: int) -> None:
+            points = self.points_of(self.shared if shared is None else shared, frame)
+            part = linearise_frame(
+                points.with_shared_fixed() if shared is None else points,
                 _at(poses, frame),
                 self.observations[frame],
                 self.band(frame, look.sigma),
@@ -215,15 +220,14 @@ class Descent:
                 look.outlier,
                 self.options,
             )
+            hessian[frame], gradient[frame], energies[frame] = (
+                part.hessian,
+                part.gradient,
+                part.energy,
+            )
 
-        return mapped(linearised, range(len(self.observations)), self.threads)
-
-    def _linearised(self, look: Look, poses: HandPose, shared: Float[Tensor, "shared"]) -> "_Whole":
-        parts = self._linearised_frames(look, poses, shared)
-        hessian = torch.stack([part.hessian for part in parts])
-        gradient = torch.stack([part.gradient for part in parts])
-        energies = torch.tensor([part.energy for part in parts])
-        rig = self.points_of(shared, 0).hand.rig
+        mapped(linearise, range(count), self.threads)
+        rig = self.points_of(self.shared, 0).hand.rig
         residuals, jacobian = habit_residuals(rig, poses.rotations)
         energies += residuals.square().sum(-1)
         jacobian = torch.nn.functional.pad(jacobian, (0, 3))
