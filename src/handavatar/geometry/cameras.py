@@ -47,7 +47,7 @@ class Camera:
                 raise ArgumentError(f"Camera.{name}", str(pair)[:60], f"{expected}, pixels")
         for name in ("width", "height"):
             size = getattr(self, name)
-            if not (isinstance(size, Integral) and size >= 1):
+            if not (isinstance(size, Integral) and int(size) >= 1):
                 raise ArgumentError(f"Camera.{name}", str(size)[:60], "a whole number, at least 1")
         require_tensor("Camera.camera_from_world", self.camera_from_world, (4, 4))
         # A GPU would have to be waited for, and cameras are made on the CPU.
