@@ -4,6 +4,7 @@ A stop names what was not finite and when, leaves only checkpoints that are good
 do; whoever does that gets a finite avatar.
 """
 
+import copy
 import json
 import math
 import re
@@ -328,7 +329,10 @@ PLACE = "corrections.translations.0"
 
 
 def _camera(frame: Frame, **changes: Any) -> Frame:
-    return replace(frame, camera=replace(frame.camera, **changes))
+    """Past what a camera refuses when it is made, as a fault of the memory would be."""
+    camera = copy.copy(frame.camera)
+    vars(camera).update(changes)
+    return replace(frame, camera=camera)
 
 
 INJECTIONS: dict[str, Injection] = {
