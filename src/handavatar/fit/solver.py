@@ -30,8 +30,8 @@ _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e4
 _LONGEST_TURN = 0.35
 """Radians of one step."""
 _FURTHER, _BACK = 0.25, 6.0
-_MOST_BAND_BYTES = 512 * 2**20
-"""Of the bands that are kept; a picture 256 wide has 1 MB a band."""
+_MOST_BYTES = 1100 * 2**20
+"""Of pictures, and of their bands that are kept; one 256 wide has half a MB, and 1 MB a band."""
 _ADDED = 64
 """Frames whose part of the shared unknowns is added up at once."""
 
@@ -85,10 +85,12 @@ class Descent:
     damping: Float[Tensor, "frames"] = field(init=False)
     shared_damping: float = 1e-2
     _bands: dict[tuple[int, float], PictureBand] = field(default_factory=dict)
+    _room: int = field(init=False)
 
     def __post_init__(self) -> None:
         """Begins with little damping."""
         self.damping = torch.full((len(self.observations),), _DAMPING)
+        self._room = _MOST_BYTES - sum(seen.picture.num_bytes for seen in self.observations)
 
     def select(self, frames: Int[Tensor, "selected"]) -> "Descent":
         """A descent of some frames, each for itself; they may repeat."""
@@ -103,7 +105,7 @@ class Descent:
             poses=_at(self.poses, frames),
             points_of=lambda shared, place: self.points_of(shared, numbers[place]),
         )
-        selected._bands = {}
+        selected._bands, selected._room = {}, self._room
         for place, number in enumerate(numbers):
             for (frame, sigma), picture in self._bands.items():
                 if frame == number:
@@ -116,7 +118,7 @@ class Descent:
         if (kept := self._bands.get(key)) is not None:
             return kept
         band = self.observations[frame].picture.band(sigma)
-        if (len(self._bands) + 1) * band.channels.nbytes <= _MOST_BAND_BYTES:
+        if (len(self._bands) + 1) * band.channels.nbytes <= self._room:
             self._bands[key] = band
         return band
 
