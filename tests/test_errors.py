@@ -185,6 +185,43 @@ def test_the_command_line_shows_arguments_as_flags(text: str, flags: str) -> Non
     assert shown(text + "\x1b") == printable(flags + "\x1b")
 
 
+COMMAND = re.compile(r"\bhandavatar ([a-z]+)(?: ([a-z][a-z-]*))?([^;\n]*)")
+# Sentences that speak of the program.
+NO_COMMANDS = {"again", "block", "cannot", "import", "imported", "metadata", "wrote"}
+
+
+def test_every_command_that_a_message_advises_exists_and_takes_its_flags(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    taken = {
+        name: {field.name for field in dataclasses.fields(options)} | {e.name for e in extras}
+        for name, (options, extras, _) in _commands(monkeypatch).items()
+    }
+    for name in [name for name in taken if name.startswith("bench ")]:
+        taken["bench"] = taken.get("bench", set()) | taken[name]
+    groups = {name.split()[0] for name in cli.COMMANDS if " " in name}
+    wrong, advised = [], set()
+    for module, tree in TREES.items():
+        for line, text in _messages(tree):
+            for first, second, rest in COMMAND.findall(text):
+                name = f"{first} {second}" if first in groups else first
+                if first in NO_COMMANDS or name == "capture of":
+                    continue
+                advised.add(name)
+                # "capture video, webcam or synth"
+                listed = re.match(r"(?:, [a-z]+)* or [a-z]+", rest) if first in groups else None
+                for other in re.findall(r"(?:, | or )([a-z]+)", listed[0] if listed else ""):
+                    if f"{first} {other}" not in cli.COMMANDS:
+                        wrong.append(f"{module}, line {line}: {first} {other}")
+                flags = re.findall(r"--([a-z][a-z.-]*)", with_flags(rest))
+                unknown = {f.replace("-", "_") for f in flags} - taken.get(name, set())
+                unknown -= {"help", "version", "quiet", "debug"}
+                if name not in cli.COMMANDS or unknown:
+                    wrong.append(f"{module}, line {line}: {name} {sorted(unknown)}")
+    assert {"capture video", "train", "render", "motion from"} <= advised
+    assert not wrong, "\n".join(wrong)
+
+
 # --- numbers --------------------------------------------------------------------------------------
 
 

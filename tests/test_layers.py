@@ -29,7 +29,7 @@ MAY_IMPORT = {
         # A hand before a camera, followed live; knows neither avatars nor pages.
         "webcam": "geometry jobs hand render fit capture tracker",
         "field": "geometry jobs hand",
-        "edit": "hand field",
+        "edit": "geometry hand field",
         # A function's work on a GPU, recorded.
         "replay": "",
         "avatar": "geometry jobs hand field render edit replay",

@@ -203,6 +203,31 @@ def test_too_many_open_files_do_not_make_an_avatar_damaged(
     assert HandAvatar.load(path) is not None
 
 
+@pytest.mark.parametrize("kind", ["edit", "export"])
+def test_a_disk_that_fills_up_under_a_command(
+    kind: str,
+    tmp_path: Path,
+    small_avatar: HandAvatar,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run, out = tmp_path / "a.safetensors", tmp_path / "b"
+    small_avatar.save(run)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(out))
+
+    monkeypatch.setattr("os.fsync", full)
+    words = ["edit", str(run), "--light-gain", "1.5"]
+    if kind == "export":
+        words = ["export", str(run), "ply"]
+        out = out.with_suffix(".ply")
+    assert cli.main([*words, "--out", str(out)]) == OUT_OF_SPACE
+    said = capsys.readouterr().err
+    assert "No space left on device" in said and "make room" in said
+    assert list(tmp_path.iterdir()) == [run]
+
+
 # --- names ----------------------------------------------------------------------------------------
 
 _NO_UTF8 = os.fsdecode(b"f\xff")

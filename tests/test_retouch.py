@@ -12,6 +12,7 @@ from PIL import Image
 from handavatar.avatar import HandAvatar, Rendering, RenderSettings
 from handavatar.capture.checks import CaptureError
 from handavatar.edit import Edit
+from handavatar.field.shading import TracedCues
 from handavatar.jobs.files import FolderInUse
 from handavatar.retouch import EditOptions, Look, anchor_places, paint_from, save_edited
 
@@ -36,6 +37,23 @@ def test_flags_become_an_edit(small_avatar: HandAvatar) -> None:
     assert Look(light_gain=1.5, albedo_shift="0.1, -0.2,0", lift_shadow="thumb, index1").edit_on(
         small_avatar
     ) == Edit(1.5, (0.1, -0.2, 0.0), (13, 14, 15, 1))
+
+
+@pytest.mark.parametrize("traced", [False, True])
+def test_it_is_said_where_lifting_a_shadow_changes_next_to_nothing(
+    small_avatar: HandAvatar, traced: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    avatar = small_avatar
+    if traced:
+        avatar = HandAvatar(avatar.base_rig, torch.zeros(10), 0, 64, cues=TracedCues(8))
+    with caplog.at_level("WARNING"):
+        Look(light_gain=1.5).edit_on(avatar)
+        assert not caplog.records
+        Look(lift_shadow="thumb").edit_on(avatar)
+    said = [record.getMessage() for record in caplog.records]
+    assert [("not traced" in one and "`method='best'`" in one) for one in said] == [True] * (
+        not traced
+    )
 
 
 def test_anchors_lie_in_the_chart_where_their_face_does(small_avatar: HandAvatar) -> None:

@@ -22,7 +22,13 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from handavatar.edit import Edit, Paint
-from handavatar.errors import ArgumentError, HandAvatarError, argument, raise_if_refused
+from handavatar.errors import (
+    ArgumentError,
+    HandAvatarError,
+    argument,
+    raise_if_refused,
+    require_ranges,
+)
 from handavatar.field.anchors import Neighbours, nearest_anchors, place_anchors
 from handavatar.field.kernels import SHORTER, Kernel, settled_kernel
 from handavatar.field.occupancy import HandCodes, PairItems, PairOccupancy, decided_items
@@ -36,8 +42,16 @@ from handavatar.field.shading import (
 )
 from handavatar.field.shape import ShapeOffsets, personal_hand
 from handavatar.field.texture import DetailTexture
-from handavatar.geometry.cameras import Camera, Rays, pixel_centers, rays_through_pixels
+from handavatar.geometry.cameras import (
+    Camera,
+    Rays,
+    pixel_centers,
+    project,
+    rays_through_pixels,
+)
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
+from handavatar.geometry.rotations import invert_rigid
+from handavatar.geometry.tensors import require_tensor, require_type
 from handavatar.hand.parts import finer_rig
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.rig import RIG_ARRAYS, PosedHand, Rig, ShapedHand
@@ -168,6 +182,9 @@ class RenderSettings:
         kernel: torch's operations or Triton's kernels for rays and occupancy; see
             :func:`handavatar.field.kernels.chosen_kernel`. With shorter factors, samples that can
             be seen are evaluated once more with long ones.
+
+    Raises:
+        ArgumentError: if a number is out of its range.
     """
 
     num_samples: int = 64
@@ -180,6 +197,13 @@ class RenderSettings:
     edge_rays: int = 2
     rays_at_once: int = 4096
     kernel: Kernel = "auto"
+
+    def __post_init__(self) -> None:
+        """Refuses numbers that are out of range."""
+        counts = {"num_samples": 4096, "coarse": 4096, "group": 4096, "edge_rays": 64}
+        require_ranges(self, **{name: (1, most) for name, most in counts.items()})
+        require_ranges(self, rays_at_once=(1, 10**9), mask_margin=(0, math.inf))
+        require_ranges(self, smallest_weight=(0, 1), stop=(0, 1), refine_above=(0, 1))
 
 
 EXACT = RenderSettings(smallest_weight=1e-7, stop=1e-7, coarse=1, mask_margin=math.inf)
@@ -467,7 +491,13 @@ class HandAvatar(nn.Module):
         Args:
             pose: of the hand in the world.
             lifted_bones: bones that shall cast no shadow, where light is traced.
+
+        Raises:
+            ArgumentError: if this is not one hand's pose, in numbers as the avatar's are.
         """
+        require_type("pose", pose, HandPose)
+        for name, shape in (("rotations", (NUM_BONES, 3)), ("translation", (3,))):
+            require_tensor(f"pose.{name}", getattr(pose, name), shape, self.coefficients.dtype)
         if self.device.type == "cuda" and not torch.is_grad_enabled():
             state = self._replay(
                 self._unlit_state,
@@ -765,8 +795,16 @@ class HandAvatar(nn.Module):
             edit: changes of the look.
             settings: samples and bounds.
 
+        Raises:
+            ArgumentError: if one of them is of another kind; or if nothing of the hand is in the
+                picture, and all of it would be if the camera's transform were inverted.
+
         Departs: the authors send one ray through every pixel, and the outline is jagged.
         """
+        for name, value, kind in (("pose", pose, HandPose), ("camera", camera, Camera)):
+            require_type(name, value, kind)
+        if edit is not None:
+            require_type("edit", edit, Edit)
         state = self.prepare(pose.to(self.device), edit.lifted_bones if edit else ())
         return self._picture(state, camera, edit, settings or RenderSettings())
 
@@ -774,8 +812,13 @@ class HandAvatar(nn.Module):
         self, state: HandState, camera: Camera, edit: Edit | None, settings: RenderSettings
     ) -> Rendering:
         camera = camera.to(self.device)
+        require_tensor(
+            "camera.camera_from_world", camera.camera_from_world, (4, 4), self.coefficients.dtype
+        )
         near = self.near_mesh(state, camera, settings.mask_margin, settings.kernel)
         near = near.flatten().nonzero()[:, 0]
+        if len(near) == 0 or math.isinf(settings.mask_margin):
+            _refuse_inverted(camera, state.posed.vertices)
         centers = pixel_centers(camera).flatten(0, 1)
         size = (camera.height, camera.width)
         flat = {
@@ -1092,11 +1135,14 @@ def _stored(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             f"{path}: not an avatar of schema {SCHEMA}; train it again with this version"
         )
     if found := find_not_finite({**tensors, **about}):
+        again = "train an avatar again"
+        if (path.parent / "run.json").is_file():
+            again = (
+                "train again into its run, from the last checkpoint: "
+                f"handavatar train CAPTURE {argument('out', path.parent)} `resume='auto'`"
+            )
         raise CheckpointError(
-            f"{path}: {found}, expected finite numbers",
-            "",
-            "copy the file again, or train again into its run, from the last checkpoint: "
-            f"handavatar train CAPTURE {argument('out', path.parent)} `resume='auto'`",
+            f"{path}: {found}, expected finite numbers", "", f"copy the file again, or {again}"
         )
     return about, tensors
 
@@ -1185,6 +1231,31 @@ def _replaced(
 ) -> Float[Tensor, "rays samples"]:
     """The same with other values at some samples, with their gradient."""
     return occupancy.flatten().index_put((samples,), values).view_as(occupancy)
+
+
+def _refuse_inverted(camera: Camera, vertices: Float[Tensor, "vertices 3"]) -> None:
+    """Refuses a camera that sees nothing of a hand which its inverse has in the picture.
+
+    Raises:
+        ArgumentError: if it is such a one.
+    """
+    inverse = replace(camera, camera_from_world=invert_rigid(camera.camera_from_world))
+    if bool(_is_seen(camera, vertices).any()) or not bool(_is_seen(inverse, vertices).all()):
+        return
+    raise ArgumentError(
+        "camera",
+        "nothing of the hand is in its picture, and all of it would be with the inverse transform",
+        "",
+        "camera_from_world takes points of the world to the camera; where the camera stands is "
+        "world_from_camera: invert_rigid(world_from_camera)",
+    )
+
+
+def _is_seen(camera: Camera, points: Float[Tensor, "points 3"]) -> Bool[Tensor, "points"]:
+    """Which points lie before a camera and in its picture."""
+    places, depths = project(camera, points)
+    size = places.new_tensor([camera.width, camera.height])
+    return (depths > 0) & ((places > 0) & (places < size)).all(-1)
 
 
 def _is_edge(alpha: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:

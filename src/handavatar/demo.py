@@ -21,6 +21,7 @@ from handavatar.jobs.files import (
     FolderInUse,
     FolderKind,
     claim_folder,
+    read_marker,
     refuse_folder_in_use,
     write_aside,
     write_atomically,
@@ -32,7 +33,8 @@ from handavatar.train.runs import RUN
 
 def _is_older_demo(folder: Path) -> bool:
     """Whether a version that left no marker has begun a demonstration there."""
-    return RUN.is_older(folder / "run")
+    # Versions that mark runs mark the demonstration, too: else it is a folder with a run in it.
+    return read_marker(folder / "run") is None and RUN.is_older(folder / "run")
 
 
 DEMONSTRATION = FolderKind("demonstration", is_older=_is_older_demo)

@@ -1,6 +1,8 @@
 """Edits of a finished avatar's look: a value that rendering takes, no training needed."""
 
+import math
 from dataclasses import dataclass, replace
+from numbers import Integral, Real
 
 import torch
 from jaxtyping import Float
@@ -8,7 +10,8 @@ from torch import Tensor
 
 from handavatar.errors import ArgumentError
 from handavatar.field.anchors import Neighbours
-from handavatar.hand.pose import BONE_NAMES, FINGER_BONES
+from handavatar.geometry.tensors import require_tensor, require_type
+from handavatar.hand.pose import BONE_NAMES, FINGER_BONES, NUM_BONES
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,10 +21,18 @@ class Paint:
     Attributes:
         colors: RGB in [0, 1], as the albedo.
         opacity: 0 leaves the skin, 1 covers it.
+
+    Raises:
+        ArgumentError: if one is no tensor of floats of this shape.
     """
 
     colors: Float[Tensor, "anchors 3"]
     opacity: Float[Tensor, "anchors"]
+
+    def __post_init__(self) -> None:
+        """Refuses what is no paint."""
+        require_tensor("Paint.colors", self.colors, (-1, 3))
+        require_tensor("Paint.opacity", self.opacity, (len(self.colors),))
 
     def over(self, below: "Paint") -> "Paint":
         """Both coats as one, this one on top."""
@@ -44,6 +55,9 @@ class Edit:
         light: in which of the avatar's lights it is shown: the number of a clip of its capture;
             None leaves that as it is, which is the first one's where nobody chose.
 
+    Raises:
+        ArgumentError: if a number cannot be: it says which.
+
     Source: paper supplement (texture editing).
     """
 
@@ -52,6 +66,26 @@ class Edit:
     lifted_bones: tuple[int, ...] = ()
     paint: Paint | None = None
     light: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuses what is no edit."""
+        if not (_is_number(self.light_gain) and self.light_gain >= 0):
+            raise ArgumentError("light_gain", str(self.light_gain)[:60], "a number, at least 0")
+        shift = self.albedo_shift
+        is_triple = isinstance(shift, tuple | list) and len(shift) == 3
+        if not (is_triple and all(_is_number(value) for value in shift)):
+            raise ArgumentError("albedo_shift", str(shift)[:60], "three numbers: red, green, blue")
+        bones = self.lifted_bones
+        is_list = isinstance(bones, tuple | list)
+        if not (is_list and all(isinstance(b, Integral) and 0 <= b < NUM_BONES for b in bones)):
+            raise ArgumentError(
+                "lifted_bones",
+                str(bones)[:60],
+                f"numbers of bones, 0 to {NUM_BONES - 1}",
+                "bones_named(('thumb',)) gives those of a finger",
+            )
+        if self.paint is not None:
+            require_type("paint", self.paint, Paint)
 
     def then(self, other: "Edit") -> "Edit":
         """This edit and another one after it, as one."""
@@ -104,6 +138,10 @@ class Edit:
         if not self.lifted_bones:
             return directed
         return directed.index_fill(-1, torch.tensor(self.lifted_bones, device=directed.device), 0.0)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and math.isfinite(value)
 
 
 def bones_named(names: tuple[str, ...]) -> tuple[int, ...]:

@@ -1,5 +1,6 @@
 """Edits from words and pictures: what the command line's flags mean, and avatars that keep them."""
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +14,9 @@ from handavatar.capture.checks import CaptureError, decoded, open_picture
 from handavatar.edit import Edit, Paint, bones_named
 from handavatar.errors import ArgumentError, HandAvatarError, require_range, require_ranges
 from handavatar.hand.rig import Rig
-from handavatar.jobs.files import refuse_file_in_use
+from handavatar.jobs.files import files_named, refuse_file_in_use
 
+_log = logging.getLogger(__name__)
 _UNSEEN_COLOR = (0.85, 0.1, 0.75)
 _UNSEEN_OPACITY = 0.7
 
@@ -52,7 +54,7 @@ class Look:
         self._bones()
 
     def edit_on(self, avatar: HandAvatar) -> Edit:
-        """The edit of this avatar.
+        """The edit of this avatar; a warning says so where it will change next to nothing.
 
         Raises:
             ValueError: what cannot be understood, or a light that the avatar does not have.
@@ -60,7 +62,13 @@ class Look:
         """
         avatar.light_of(Edit(light=self.light))
         paint = None if self.paint is None else paint_from(self.paint, avatar)
-        return Edit(self.light_gain, self._shift(), self._bones(), paint, self.light)
+        bones = self._bones()
+        if bones and avatar.illumination.chosen.num_directions == 0:
+            _log.warning(
+                "`lift_shadow`: this avatar's light was not traced, so that next to nothing of a "
+                "shadow is lifted; train it with `method='best'`"
+            )
+        return Edit(self.light_gain, self._shift(), bones, paint, self.light)
 
     def _shift(self) -> tuple[float, float, float]:
         try:
@@ -102,7 +110,8 @@ def save_edited(options: EditOptions) -> Path:
         ValueError: what cannot be understood.
     """
     options.check_look()
-    refuse_file_in_use(options.out, options.overwrite)
+    read = (options.run, options.run / "avatar.safetensors", *files_named(options.paint))
+    refuse_file_in_use(options.out, options.overwrite, read)
     avatar = HandAvatar.load(options.run)
     avatar.edit = avatar.edit.then(options.edit_on(avatar))
     avatar.save(options.out)

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import av
 import numpy as np
 import pytest
+from PIL import Image
 from videos import grey_levels, save_sound, save_video
 
 from handavatar.capture.checks import CaptureError
@@ -27,10 +28,21 @@ def test_every_third_picture_of_thirty_per_second(tmp_path: Path) -> None:
     assert np.allclose(levels, [4 * frame.index for frame in frames], atol=6)
 
 
-@pytest.mark.parametrize("name", ["a.mp4", "a.mov", "a.mkv"])
+@pytest.mark.parametrize("name", ["a.mp4", "a.mov", "a.mkv", "a.avi", "a.ts"])
 def test_common_containers_open(tmp_path: Path, name: str) -> None:
     path = save_video(tmp_path / name, grey_levels(6))
     assert len(list(video_frames(path, Sampling(fps=30.0)))) == 6
+
+
+def test_an_animated_picture_is_a_video(tmp_path: Path) -> None:
+    pictures = [Image.fromarray(image) for image in grey_levels(6)]
+    path = tmp_path / "a.gif"
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=100, loop=0)
+    frames = list(video_frames(path, Sampling(fps=10.0)))
+    assert [round(frame.time, 3) for frame in frames] == [0.0, 0.1, 0.2, 0.3, 0.4, 0.5]
+    assert [int(frame.image[90, 80, 2]) for frame in frames] == pytest.approx(
+        [4 * number for number in range(6)], abs=3
+    )
 
 
 def test_stops_at_the_greatest_number_of_pictures(tmp_path: Path) -> None:

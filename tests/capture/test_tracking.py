@@ -340,3 +340,13 @@ def test_two_real_hands_are_refused() -> None:
     ]
     with pytest.raises(CaptureError, match="two hands"):
         track_hand(doubled)
+
+
+def test_too_few_pictures_are_no_fault_of_the_hand() -> None:
+    with pytest.raises(UnusableTrackError, match="found in 2 of 2 pictures") as caught:
+        track_hand(_frames(2), finder=_Finder({}))
+    assert "dark" in str(caught.value)
+    bright = [replace(frame, image=frame.image + np.uint8(100)) for frame in _frames(2)]
+    with pytest.raises(UnusableTrackError, match="found in 2 of 2 pictures") as caught:
+        track_hand(bright, finder=_Finder({}))
+    assert caught.value.remedy.startswith("take more pictures: `max_frames`")

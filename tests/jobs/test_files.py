@@ -371,19 +371,29 @@ def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
     assert path.stat().st_mode == neighbour.stat().st_mode, "the user's usual mode"
 
 
-@pytest.mark.parametrize("kind", ["file", "folder", "link"])
-def test_a_file_in_use_is_refused(tmp_path: Path, kind: str) -> None:
+@pytest.mark.parametrize(
+    ("build", "says"),
+    [
+        (_file, "exists"),
+        (_unmarked, "is no file"),
+        (_link, "is a link"),
+        (_dangling, "is a link"),
+        (lambda place: place.symlink_to(place.with_name("other")), "is a link"),
+    ],
+)
+def test_a_file_in_use_is_refused(
+    tmp_path: Path, build: Callable[[Path], object], says: str
+) -> None:
     place = tmp_path / "place"
     refuse_file_in_use(place)
-    if kind == "file":
-        place.write_text("mine")
-        refuse_file_in_use(place, overwrite=True)
-    elif kind == "folder":
-        place.mkdir()
-    else:
-        place.symlink_to(tmp_path / "nowhere")
-    with pytest.raises(FolderInUse, match="exists" if kind == "file" else "is no file"):
-        refuse_file_in_use(place, overwrite=kind != "file")
+    (tmp_path / "other").write_text("theirs")
+    build(place)
+    if build is _file:
+        refuse_file_in_use(place, overwrite=True, inputs=[tmp_path / "other", tmp_path / "none"])
+        with pytest.raises(FolderInUse, match="is what is read"):
+            refuse_file_in_use(place, overwrite=True, inputs=[tmp_path / "." / "place"])
+    with pytest.raises(FolderInUse, match=says):
+        refuse_file_in_use(place, overwrite=build is not _file)
 
 
 def _unfinished(target: Path, record: int = 1) -> UnfinishedFolder:

@@ -14,10 +14,16 @@ from handavatar.capture.checks import CaptureError
 from handavatar.capture.degraded import DegradeOptions, degrade_capture
 from handavatar.capture.pathtracer import LIGHTINGS
 from handavatar.capture.synthetic import SynthOptions, make_capture
-from handavatar.jobs.files import FolderKind, make_folder
+from handavatar.jobs.files import FolderKind, claim_folder, make_folder
 from handavatar.jobs.progress import SILENT, Progress
 
-BENCHMARK = FolderKind("benchmark")
+
+def _is_older(folder: Path) -> bool:
+    """Whether a version that left no marker has made captures there."""
+    return any((folder / size / name).is_dir() for size in _SIZES for name in benchmark_names())
+
+
+BENCHMARK = FolderKind("benchmark", is_older=_is_older)
 """A folder of captures, each in a folder of its name."""
 
 SUBJECTS: dict[str, tuple[int, float]] = {
@@ -118,8 +124,9 @@ def make_benchmark(
 
     Raises:
         CaptureError: for an unknown name, or if Mitsuba is missing.
+        FolderInUse: if ``folder`` holds something else.
     """
-    make_folder(folder, BENCHMARK)
+    claim_folder(folder, BENCHMARK)
     make_folder(folder / options.size, BENCHMARK)
     folders = []
     parts = progress.stages({name: 1.0 for name in options.names()})

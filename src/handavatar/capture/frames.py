@@ -44,6 +44,7 @@ from handavatar.errors import raise_if_refused
 from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.rotations import invert_rigid
+from handavatar.geometry.tensors import require_tensor, require_type
 from handavatar.hand.landmarks import NUM_LANDMARKS
 from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.jobs.files import (
@@ -147,6 +148,10 @@ class Frame:
             capture does not say.
         landmarks: that a tracker saw; None where the capture does not say.
         clip: number of the recording that it belongs to, from 0: each has a light of its own.
+
+    Raises:
+        ArgumentError: if image, coverage, what is known and the camera are not of one size, or one
+            of them is of another kind.
     """
 
     name: str
@@ -164,11 +169,19 @@ class Frame:
     clip: int = 0
 
     def __post_init__(self) -> None:
-        """Fills in what most pictures need not say."""
+        """Fills in what most pictures need not say, and refuses what is no frame."""
+        require_type("Frame.camera", self.camera, Camera)
+        require_type("Frame.pose", self.pose, HandPose)
+        size = (self.camera.height, self.camera.width)
+        require_tensor("Frame.image", self.image, (*size, 3), torch.uint8)
+        require_tensor("Frame.coverage", self.coverage, size, torch.uint8)
+        require_tensor("Frame.pose.rotations", self.pose.rotations, (NUM_BONES, 3))
         if self.known is None:
             object.__setattr__(self, "known", torch.ones_like(self.coverage, dtype=torch.bool))
         if self.gain is None:
             object.__setattr__(self, "gain", torch.ones(3))
+        require_tensor("Frame.known", self.known, size, torch.bool)
+        require_tensor("Frame.gain", self.gain, (3,))
 
     @property
     def mask(self) -> Bool[Tensor, "height width"]:
@@ -539,7 +552,7 @@ def _header(content: dict[str, Any]) -> dict[str, Any]:
     if not isinstance(ours, dict):
         raise CaptureError(
             "there is no handavatar block: a nerfstudio capture does not know the hand's pose",
-            "make the capture with handavatar capture video, interhand or synth",
+            "make a capture of a video of it: handavatar capture video FILE",
         )
     if ours.get("schema") != SCHEMA:
         raise CaptureError(

@@ -18,12 +18,14 @@ from torch import Tensor
 
 from handavatar.capture.checks import CaptureError, load_json, number
 from handavatar.capture.motion_values import MAX_STEPS, rotations_of, translations_of
+from handavatar.errors import require_ranges
 from handavatar.geometry.rotations import (
     axis_angle_from_matrix,
     matrix_from_axis_angle,
     rotations_between,
 )
-from handavatar.hand.pose import HandPose
+from handavatar.geometry.tensors import require_tensor
+from handavatar.hand.pose import NUM_BONES, HandPose
 from handavatar.hand.pose_sampling import (
     GESTURES,
     Gesture,
@@ -176,11 +178,20 @@ class Motion:
         fps: steps per second.
         rotations: axis-angle, radians, wrist relative to the world.
         translations: metres.
+
+    Raises:
+        ArgumentError: if one is no tensor of floats of this shape, or there is no such speed.
     """
 
     fps: float
     rotations: Float[Tensor, "steps bones 3"]
     translations: Float[Tensor, "steps 3"]
+
+    def __post_init__(self) -> None:
+        """Refuses what is no motion."""
+        require_ranges(self, fps=(0.01, 1000))
+        require_tensor("Motion.rotations", self.rotations, (-1, NUM_BONES, 3))
+        require_tensor("Motion.translations", self.translations, (len(self.rotations), 3))
 
     def __len__(self) -> int:
         """Number of steps."""

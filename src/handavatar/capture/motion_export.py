@@ -39,7 +39,7 @@ def motion_to(options: MotionToOptions) -> Motion:
         CaptureError: the source is no motion, or the name does not end with ``.npz``.
         FolderInUse: there is a file at ``out`` already.
     """
-    refuse_file_in_use(options.out, options.overwrite)
+    refuse_file_in_use(options.out, options.overwrite, [options.source])
     motion = read_motion(options.source)
     write_soma(options.out, motion, load_rig(options.rig), options.side)
     return motion

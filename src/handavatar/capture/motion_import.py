@@ -86,7 +86,7 @@ def motion_from(
         FolderInUse: there is a file at ``out`` already.
         LicensedRigMissing: a file cannot be read without the user's own MANO file.
     """
-    refuse_file_in_use(options.out, options.overwrite)
+    refuse_file_in_use(options.out, options.overwrite, [options.source])
     if (options.source / "transforms.json").is_file():
         return motion_of_capture(read_capture(options.source), options.fps, tell)
     is_told = options.layout != "auto"

@@ -583,9 +583,10 @@ def _check_found(track: Track) -> None:
                 "record in more light",
                 track,
             )
-        raise UnusableTrackError(
-            found, "record one bare hand, whole, larger than a sixth of the picture", track
-        )
+        remedy = "record one bare hand, whole, larger than a sixth of the picture"
+        if total < _MIN_FRAMES and len(track.hands) == total:
+            remedy = "take more pictures: `max_frames`, `fps`, `start`, `end`, or a longer video"
+        raise UnusableTrackError(found, remedy, track)
 
 
 def has_mediapipe() -> bool:

@@ -135,11 +135,11 @@ def refine(words: list[str], progress: Progress) -> int:
     )
     options, extras = parse_with(RefinementOptions, extras_wanted, words, "rig refine")
     out: Path = extras["out"]
-    base = load_open_hand(extras["level"])
-    problem = SkinRefinement.of(base, extras["rounds"], options)
     part = out.with_name(out.name + ".part")
     refuse_file_in_use(out, extras["overwrite"])
     refuse_file_in_use(part, extras["overwrite"] or extras["resume"])
+    base = load_open_hand(extras["level"])
+    problem = SkinRefinement.of(base, extras["rounds"], options)
     is_continued = extras["resume"] and part.is_file()
     state = RefinementState.load(part, problem) if is_continued else problem.begin()
     progress.skip(state.step, problem.total_steps)

@@ -125,7 +125,7 @@ def _check(options: ExportOptions) -> None:
             "motion", f"{options.format.upper()} cannot move; choose glb, or `pose`"
         )
     for path in _files(options):
-        refuse_file_in_use(path, options.overwrite)
+        refuse_file_in_use(path, options.overwrite, _inputs(options))
 
 
 def _inputs(options: ExportOptions) -> list[Path]:

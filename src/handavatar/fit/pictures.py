@@ -72,6 +72,11 @@ class FramePicture:
         return FramePicture(camera, pixels, gain, marks, distance, border, normals)
 
     @property
+    def num_bytes(self) -> int:
+        """That it holds."""
+        return sum(each.nbytes for each in vars(self).values() if isinstance(each, Tensor))
+
+    @property
     def color(self) -> Float[Tensor, "height width 3"]:
         """SRGB in [0, 1], divided by the frame's gain."""
         values = self.pixels if self.pixels.is_floating_point() else self.pixels.float() / 255

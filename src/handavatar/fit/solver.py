@@ -15,6 +15,7 @@ from handavatar.fit.appearance import SeenTexture, SkinTexture, see_texture
 from handavatar.fit.energy import (
     EnergyOptions,
     HandPoints,
+    Linearised,
     Observation,
     linearise_frame,
 )
@@ -29,8 +30,10 @@ _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e4
 _LONGEST_TURN = 0.35
 """Radians of one step."""
 _FURTHER, _BACK = 0.25, 6.0
-_MOST_BAND_BYTES = 512 * 2**20
-"""Of the bands that are kept; a picture 256 wide has 1 MB a band."""
+_MOST_BYTES = 1100 * 2**20
+"""Of pictures, and of their bands that are kept; one 256 wide has half a MB, and 1 MB a band."""
+_ADDED = 64
+"""Frames whose part of the shared unknowns is added up at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +85,12 @@ class Descent:
     damping: Float[Tensor, "frames"] = field(init=False)
     shared_damping: float = 1e-2
     _bands: dict[tuple[int, float], PictureBand] = field(default_factory=dict)
+    _room: int = field(init=False)
 
     def __post_init__(self) -> None:
         """Begins with little damping."""
         self.damping = torch.full((len(self.observations),), _DAMPING)
+        self._room = _MOST_BYTES - sum(seen.picture.num_bytes for seen in self.observations)
 
     def select(self, frames: Int[Tensor, "selected"]) -> "Descent":
         """A descent of some frames, each for itself; they may repeat."""
@@ -100,7 +105,7 @@ class Descent:
             poses=_at(self.poses, frames),
             points_of=lambda shared, place: self.points_of(shared, numbers[place]),
         )
-        selected._bands = {}
+        selected._bands, selected._room = {}, self._room
         for place, number in enumerate(numbers):
             for (frame, sigma), picture in self._bands.items():
                 if frame == number:
@@ -113,7 +118,7 @@ class Descent:
         if (kept := self._bands.get(key)) is not None:
             return kept
         band = self.observations[frame].picture.band(sigma)
-        if (len(self._bands) + 1) * band.channels.nbytes <= _MOST_BAND_BYTES:
+        if (len(self._bands) + 1) * band.channels.nbytes <= self._room:
             self._bands[key] = band
         return band
 
@@ -201,15 +206,18 @@ class Descent:
         self, look: Look, poses: HandPose, shared: Float[Tensor, "shared"] | None = None
     ) -> "_Whole":
         """What all frames say at some poses; of the shared unknowns' slopes only if these move."""
-        count = len(self.observations)
-        size = NUM_UNKNOWNS + (0 if shared is None else len(shared))
-        # Each frame's matrix goes to its place at once: they are the most that is held here.
-        hessian, gradient = torch.zeros(count, size, size), torch.zeros(count, size)
-        energies = torch.zeros(count)
+        count, num_shared = len(self.observations), 0 if shared is None else len(shared)
+        # Of a thousand frames these matrices are the most that is held: those of the shared
+        # unknowns are added up, some frames at a time.
+        blocks = torch.zeros(count, NUM_UNKNOWNS, NUM_UNKNOWNS)
+        mixed = torch.zeros(count, NUM_UNKNOWNS, num_shared)
+        gradient, energies = torch.zeros(count, NUM_UNKNOWNS), torch.zeros(count)
+        curvature, slope = torch.zeros(num_shared, num_shared), torch.zeros(num_shared)
+        own, others = slice(NUM_UNKNOWNS), slice(NUM_UNKNOWNS, None)
 
-        def linearise(frame: int) -> None:
+        def linearised(frame: int) -> Linearised:
             points = self.points_of(self.shared if shared is None else shared, frame)
-            part = linearise_frame(
+            return linearise_frame(
                 points.with_shared_fixed() if shared is None else points,
                 _at(poses, frame),
                 self.observations[frame],
@@ -220,34 +228,51 @@ class Descent:
                 look.outlier,
                 self.options,
             )
-            hessian[frame], gradient[frame], energies[frame] = (
-                part.hessian,
-                part.gradient,
-                part.energy,
-            )
 
-        mapped(linearise, range(count), self.threads)
+        for start in range(0, count, _ADDED):
+            some = slice(start, min(start + _ADDED, count))
+            parts = mapped(linearised, range(count)[some], self.threads)
+            hessians = torch.stack([part.hessian for part in parts])
+            gradients = torch.stack([part.gradient for part in parts])
+            blocks[some], mixed[some] = hessians[:, own, own], hessians[:, own, others]
+            gradient[some] = gradients[:, own]
+            energies[some] = torch.tensor([part.energy for part in parts])
+            curvature += hessians[:, others, others].sum(0)
+            slope += gradients[:, others].sum(0)
         rig = self.points_of(self.shared, 0).hand.rig
         residuals, jacobian = habit_residuals(rig, poses.rotations)
         energies += residuals.square().sum(-1)
         jacobian = torch.nn.functional.pad(jacobian, (0, 3))
-        hessian[:, :NUM_UNKNOWNS, :NUM_UNKNOWNS] += jacobian.mT @ jacobian + self.information
+        blocks += jacobian.mT @ jacobian + self.information
         away = pose_difference(self.tracked, poses)
         pull = (self.information @ away[..., None])[..., 0]
-        gradient[:, :NUM_UNKNOWNS] += (jacobian.mT @ residuals[..., None])[..., 0] + pull
+        gradient += (jacobian.mT @ residuals[..., None])[..., 0] + pull
         energies += (away * pull).sum(-1)
         motion = motion_terms(poses, self.times if self.is_sequence else self.times[:0])
-        return _Whole(hessian, gradient, energies, motion)
+        return _Whole(blocks, gradient, energies, motion, mixed, curvature, slope)
 
 
 @dataclass(frozen=True, eq=False)
 class _Whole:
-    """All frames, linearised."""
+    """All frames, linearised.
 
-    hessian: Float[Tensor, "frames unknowns unknowns"]
-    gradient: Float[Tensor, "frames unknowns"]
+    Attributes:
+        blocks: each frame's own matrix.
+        gradient: of each frame's pose.
+        own_energies: of each frame, without motion.
+        motion: what joins neighbours.
+        mixed: of each frame's pose with the shared unknowns, if these move.
+        curvature: of the shared unknowns, sum of all frames.
+        slope: their gradient, sum of all frames.
+    """
+
+    blocks: Float[Tensor, "frames 51 51"]
+    gradient: Float[Tensor, "frames 51"]
     own_energies: Float[Tensor, "frames"]
     motion: MotionTerms
+    mixed: Float[Tensor, "frames 51 shared"]
+    curvature: Float[Tensor, "shared shared"]
+    slope: Float[Tensor, "shared"]
 
     @property
     def energies(self) -> Float[Tensor, "frames"]:
@@ -255,26 +280,24 @@ class _Whole:
 
     def pose_blocks(self) -> Float[Tensor, "frames 51 51"]:
         """Each frame's own matrix with its neighbours held still."""
-        blocks = self.hessian[:, :NUM_UNKNOWNS, :NUM_UNKNOWNS]
-        return blocks + torch.diag_embed(self.motion.curvature(len(blocks)))
+        return self.blocks + torch.diag_embed(self.motion.curvature(len(self.blocks)))
 
     def merged(self, is_other: Bool[Tensor, "frames"], other: "_Whole") -> "_Whole":
-        """Some frames of another."""
-        return _Whole(
-            torch.where(is_other[:, None, None], other.hessian, self.hessian),
-            torch.where(is_other[:, None], other.gradient, self.gradient),
-            torch.where(is_other, other.own_energies, self.own_energies),
-            self.motion,
+        """Some frames of another; of poses alone."""
+        return replace(
+            self,
+            blocks=torch.where(is_other[:, None, None], other.blocks, self.blocks),
+            gradient=torch.where(is_other[:, None], other.gradient, self.gradient),
+            own_energies=torch.where(is_other, other.own_energies, self.own_energies),
         )
 
     def _damped(self, damping: Float[Tensor, "frames"]) -> Float[Tensor, "frames 51 51"]:
-        blocks = self.hessian[:, :NUM_UNKNOWNS, :NUM_UNKNOWNS]
-        diagonal = blocks.diagonal(dim1=-2, dim2=-1)
-        return blocks + torch.diag_embed(damping[:, None] * diagonal)
+        diagonal = self.blocks.diagonal(dim1=-2, dim2=-1)
+        return self.blocks + torch.diag_embed(damping[:, None] * diagonal)
 
     def solve(self, damping: Float[Tensor, "frames"]) -> Float[Tensor, "frames 51"]:
         """The step of all poses, the shape held still."""
-        gradient = self.gradient[:, :NUM_UNKNOWNS] + self.motion.gradient(len(damping))
+        gradient = self.gradient + self.motion.gradient(len(damping))
         step = -solve_chain(self._damped(damping), self.motion, gradient[..., None])[..., 0]
         return _bounded(step)
 
@@ -286,17 +309,14 @@ class _Whole:
         shared_damping: float,
     ) -> tuple[Float[Tensor, "frames 51"], Float[Tensor, "shared"]]:
         """The step of poses and shared unknowns together."""
-        poses = slice(NUM_UNKNOWNS)
-        others = slice(NUM_UNKNOWNS, None)
-        gradient = self.gradient[:, poses] + self.motion.gradient(len(damping))
-        mixed = self.hessian[:, poses, others]
-        right = torch.cat([gradient[..., None], mixed], dim=-1)
+        gradient = self.gradient + self.motion.gradient(len(damping))
+        right = torch.cat([gradient[..., None], self.mixed], dim=-1)
         solved = solve_chain(self._damped(damping), self.motion, right)
         own, along = solved[..., 0], solved[..., 1:]
-        curvature = self.hessian[:, others, others].sum(0) + torch.diag(sigmas**-2)
-        slope = self.gradient[:, others].sum(0) + shared / sigmas**2
-        reduced = curvature - torch.einsum("fps,fpt->st", mixed, along)
-        slope = slope - torch.einsum("fps,fp->s", mixed, own)
+        curvature = self.curvature + torch.diag(sigmas**-2)
+        slope = self.slope + shared / sigmas**2
+        reduced = curvature - torch.einsum("fps,fpt->st", self.mixed, along)
+        slope = slope - torch.einsum("fps,fp->s", self.mixed, own)
         reduced = reduced + shared_damping * torch.diag(curvature.diagonal())
         change = -torch.linalg.solve(reduced.double(), slope.double()).float()
         return _bounded(-own - along @ change), change

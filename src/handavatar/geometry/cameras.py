@@ -1,12 +1,19 @@
 """Pinhole cameras in OpenCV axes (x right, y down, z forward), pixel centres at +0.5."""
 
+import math
 from dataclasses import dataclass, replace
+from numbers import Integral, Real
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from handavatar.errors import ArgumentError
 from handavatar.geometry.rotations import rigid_transform
+from handavatar.geometry.tensors import require_tensor
+
+_RIGID = 1e-3
+"""How far the entries of a rotation times its transpose may be from those of the identity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,6 +26,10 @@ class Camera:
         width: image width, pixels.
         height: image height, pixels.
         camera_from_world: rigid transform, metres, OpenCV camera axes.
+
+    Raises:
+        ArgumentError: if a length or size cannot be, or the transform is no 4 x 4 tensor of floats,
+            or, on a CPU, not rigid: it may not mirror or scale.
     """
 
     focal: tuple[float, float]
@@ -26,6 +37,22 @@ class Camera:
     width: int
     height: int
     camera_from_world: Float[Tensor, "4 4"]
+
+    def __post_init__(self) -> None:
+        """Refuses what is no camera."""
+        for name, least in (("focal", 0.0), ("center", -math.inf)):
+            pair = getattr(self, name)
+            if not (_are_two_numbers(pair) and min(pair) > least):
+                expected = "two finite numbers" + (" above zero" if least == 0 else "")
+                raise ArgumentError(f"Camera.{name}", str(pair)[:60], f"{expected}, pixels")
+        for name in ("width", "height"):
+            size = getattr(self, name)
+            if not (isinstance(size, Integral) and int(size) >= 1):
+                raise ArgumentError(f"Camera.{name}", str(size)[:60], "a whole number, at least 1")
+        require_tensor("Camera.camera_from_world", self.camera_from_world, (4, 4))
+        # A GPU would have to be waited for, and cameras are made on the CPU.
+        if self.camera_from_world.device.type == "cpu":
+            _require_rigid(self.camera_from_world.detach().double())
 
     def to(self, device: torch.device | str) -> "Camera":
         """The same camera with its transform on another device."""
@@ -57,6 +84,35 @@ class Camera:
             width=round(width),
             height=round(height),
         )
+
+
+def _are_two_numbers(value: object) -> bool:
+    return (
+        isinstance(value, tuple | list)
+        and len(value) == 2
+        and all(isinstance(number, Real) and math.isfinite(number) for number in value)
+    )
+
+
+def _require_rigid(transform: Tensor) -> None:
+    rotation = transform[:3, :3]
+    excess = (rotation @ rotation.T - torch.eye(3, dtype=rotation.dtype)).abs().max()
+    # An inverse that was computed in general has rounding in its last row.
+    last = (transform[3] - transform.new_tensor([0.0, 0, 0, 1])).abs().max()
+    if bool((excess < _RIGID) & (last < _RIGID)) and bool(transform.isfinite().all()):
+        if float(torch.linalg.det(rotation)) > 0:
+            return
+        raise ArgumentError(
+            "Camera.camera_from_world",
+            "a mirrored camera (its determinant is -1)",
+            "a rotation and a translation",
+            "turn two axes and not one: OpenCV's are x right, y down, z forward",
+        )
+    raise ArgumentError(
+        "Camera.camera_from_world",
+        f"a matrix that is not rigid: {[[round(v, 3) for v in row] for row in transform.tolist()]}",
+        "a rotation and a translation, last row 0 0 0 1",
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,12 +7,14 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from handavatar.errors import ArgumentError
 from handavatar.geometry.rotations import (
     axis_angle_from_matrix,
     left_jacobian,
     matrix_from_axis_angle,
     rigid_transform,
 )
+from handavatar.geometry.tensors import require_tensor
 
 BONE_NAMES: tuple[str, ...] = (
     "wrist",
@@ -51,10 +53,24 @@ class HandPose:
         rotations: axis-angle in radians per bone in the order of ``BONE_NAMES``, relative to the
             parent bone; the wrist's is relative to the world. Zero is the flat hand.
         translation: metres; the posed wrist joint lies at the rest wrist joint plus this.
+
+    Raises:
+        ArgumentError: if one is no tensor of floats of this shape.
     """
 
     rotations: Float[Tensor, "*batch bones 3"]
     translation: Float[Tensor, "*batch 3"]
+
+    def __post_init__(self) -> None:
+        """Refuses what is no pose."""
+        require_tensor("HandPose.rotations", self.rotations, (NUM_BONES, 3), is_batch=True)
+        require_tensor("HandPose.translation", self.translation, (3,), is_batch=True)
+        if self.rotations.shape[:-2] != self.translation.shape[:-1]:
+            raise ArgumentError(
+                "HandPose.translation",
+                f"a tensor of shape {tuple(self.translation.shape)}",
+                f"one place for each hand of rotations {tuple(self.rotations.shape)}",
+            )
 
     @staticmethod
     def flat(device: torch.device | str = "cpu") -> "HandPose":

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from handavatar.errors import ErrorKind, HandAvatarError
 from handavatar.geometry.meshes import boundary_loop
+from handavatar.geometry.tensors import require_tensor
 from handavatar.hand.pose import NUM_BONES, HandPose, bone_transforms, linear_blend_skinning
 from handavatar.hand.pose_features import NUM_POSE_FEATURES, pose_features
 
@@ -189,10 +190,15 @@ class Rig:
     def shaped(self, coefficients: Float[Tensor, "*batch shapes"] | None = None) -> "ShapedHand":
         """The rest hand of given shape coefficients (units: standard deviations).
 
+        Raises:
+            ArgumentError: if they are no tensor of floats, one for each of the rig's directions.
+
         Source: paper appendix A, the shape equation. What the pose adds, adds ``ShapedHand.posed``.
         """
         vertices = self.template_vertices
         if coefficients is not None:
+            count = self.shape_directions.shape[-1]
+            require_tensor("coefficients", coefficients, (count,), vertices.dtype, is_batch=True)
             vertices = vertices + torch.einsum(
                 "vcs,...s->...vc", self.shape_directions, coefficients
             )

@@ -311,20 +311,25 @@ def files_named(*names: str | Path | None) -> list[Path]:
     return [Path(name) for name in names if name is not None and Path(name).is_file()]
 
 
-def refuse_file_in_use(path: Path, overwrite: bool = False) -> None:
+def refuse_file_in_use(path: Path, overwrite: bool = False, inputs: Iterable[Path] = ()) -> None:
     """Refuses a place for a new file where something lies.
 
     Args:
         path: where the file is to be.
-        overwrite: whether a file, which nothing marks as the program's, may be replaced.
+        overwrite: whether a file, which nothing marks as the program's, may be replaced; never a
+            link, nor what is read.
+        inputs: files that are read.
 
     Raises:
         FolderInUse: if a file lies there, or something that is none.
     """
     if not os.path.lexists(path):
         return
-    if not path.is_file():
-        raise FolderInUse(f"{path} is no file, expected none or a file", "name another file")
+    if path.is_symlink() or not path.is_file():
+        kind = "a link" if path.is_symlink() else "no file"
+        raise FolderInUse(f"{path} is {kind}, expected none or a file", "name another file")
+    if any(_is_same(path, other) for other in inputs):
+        raise FolderInUse(f"{path} is what is read", "name another file")
     if not overwrite:
         raise FolderInUse(f"{path} exists", "name another file, or use `overwrite=True`")
 
@@ -683,9 +688,11 @@ class UnfinishedFolder:
             return True
         strangers = strangers_in(self.path, self._kind) if is_ours else []
         if not is_ours or strangers:
-            what = f"holds {_listed(strangers)}, which" if strangers else "is in the way, and"
+            what = "is in the way: this program did not leave it there"
+            if strangers:
+                what = f"holds {_listed(strangers)}, which this program did not leave there"
             raise FolderInUse(
-                f"{self.path} {what} this program did not leave there: it stays",
+                f"{self.path} {what}: it stays",
                 "move it away, or name another folder",
             )
         return False
