@@ -27,10 +27,13 @@ from layout_files import (
     write_twin,
 )
 
+from handavatar.capture.motion import Motion
 from handavatar.capture.motion_files import stored
+from handavatar.capture.motion_files.soma import soma_arrays
 from handavatar.cli import main
 from handavatar.geometry.rotations import matrix_from_axis_angle
 from handavatar.hand.mano import read_mano
+from handavatar.hand.open_hand import load_open_hand
 from handavatar.hand.rigs import save_rig
 
 BAD_DATA, NO_LICENCE = 3, 4
@@ -481,3 +484,21 @@ def test_frames_are_numbered_by_plain_digits(refusal: Any, tmp_path: Path) -> No
     for name in ("\u00b2", "9" * 5000):
         (tmp_path / "a.json").write_text(json.dumps({name: {"right": None, "left": None}}))
         assert refusal(tmp_path / "a.json", "--layout", "interhand", "--fps", "30")
+
+
+def test_several_poses_in_one_frame_are_refused(right: Truth, refusal: Any, tmp_path: Path) -> None:
+    frames = interhand_frames(right)
+    hand = frames["0"]["1203"]["right"]
+    hand["pose"] = [hand["pose"]] * 16
+    (tmp_path / "a.json").write_text(json.dumps(frames))
+    assert "frame 1203 holds 16 poses" in refusal(tmp_path / "a.json", "--fps", "30")
+
+
+def test_places_of_soma_that_are_no_triples_are_refused(
+    right: Truth, refusal: Any, tmp_path: Path
+) -> None:
+    motion = Motion(30.0, right.rotations.float(), right.places.float())
+    arrays = soma_arrays(motion, load_open_hand(), "right")
+    for places in (np.zeros((len(motion), 4)), np.zeros(1), np.zeros(())):
+        np.savez(tmp_path / "a.npz", **(arrays | {"transl": places}))
+        assert "transl has shape" in refusal(tmp_path / "a.npz")

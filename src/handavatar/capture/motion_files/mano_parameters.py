@@ -134,6 +134,12 @@ def read_interhand(
     side = choose_side("left" in held, "right" in held, conventions, source)
     chosen = sorted((h for h in hands if h[1] == side), key=lambda hand: hand[0])
     stored = [_stored_hand(Part(source, n, fields), side, conventions) for n, _, fields in chosen]
+    for (number, _, _), hand in zip(chosen, stored, strict=True):
+        if len(hand.root) != 1:
+            raise CaptureError(
+                f"{source}: frame {number} holds {len(hand.root)} poses of one hand",
+                "write one pose of 48 numbers for each frame",
+            )
     step = max(math.gcd(*(number - hands[0][0] for number, _, _ in hands)), 1)
     frames = torch.tensor([(number - chosen[0][0]) // step for number, _, _ in chosen])
     whole = _joined(stored, frames, source)

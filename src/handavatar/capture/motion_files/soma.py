@@ -34,7 +34,12 @@ from handavatar.capture.motion_files.parameters import (
     rate_of,
     track_of_rows,
 )
-from handavatar.capture.motion_files.stored import Part, array_field, text_value
+from handavatar.capture.motion_files.stored import (
+    Part,
+    array_field,
+    rows_of,
+    text_value,
+)
 from handavatar.capture.motion_files.track import (
     UNITS,
     Conventions,
@@ -161,7 +166,8 @@ def read_soma(part: Part, conventions: Conventions) -> HandTrack:
     if is_body:
         notes.append("SOMA-X body: fingers alone; the wrist stays where it rests")
     else:
-        places = torch.from_numpy(array_field(fields, ("transl",), path)).reshape(-1, 3)
+        values = array_field(fields, ("transl",), path)
+        places = torch.from_numpy(rows_of(values, (3,), "transl", path))
         if conventions.unit != "m" and UNITS[conventions.unit] != _unit(part):
             raise CaptureError(
                 f"{path}: its unit is {text_value(fields['unit'])}, `unit` says {conventions.unit}",
