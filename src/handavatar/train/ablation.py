@@ -239,12 +239,14 @@ class View:
     """A picture that shadings are judged on, as samples that stay.
 
     Attributes:
-        frame: the truth, or only camera and pose.
+        frame: the truth, or only its pose.
+        camera: of the samples; the frame's, or one that looks the same way.
         samples: of every pixel near the hand, in the order of ``pixels``.
-        pixels: their numbers in the picture.
+        pixels: their numbers in the camera's picture.
     """
 
     frame: Frame
+    camera: Camera
     samples: SeenSamples
     pixels: Int[Tensor, "pixels"]
 
@@ -347,7 +349,7 @@ def view_of_frame(
     near = avatar.near_mesh(state, camera, settings.mask_margin).flatten().nonzero()[:, 0]
     rays = rays_through_pixels(camera, pixel_centers(camera).flatten(0, 1)[near])
     seen = _samples_along(avatar, state, rays, settings).seen
-    return View(replace(frame, camera=camera), seen, near)
+    return View(frame, camera, seen, near)
 
 
 @dataclass(frozen=True, eq=False)
@@ -464,7 +466,7 @@ def trained_shading(
 @torch.no_grad()
 def shaded_view(shading: Shading, view: View) -> dict[str, Tensor]:
     """Colour, albedo, illumination and alpha of a whole picture, on black."""
-    seen, camera = view.samples, view.frame.camera
+    seen, camera = view.samples, view.camera
     every = torch.arange(len(seen.weights))
     counts = seen.starts.diff()
     ray = torch.arange(len(view.pixels)).repeat_interleave(counts)
