@@ -170,6 +170,35 @@ def test_a_true_shape_stays(rig: Rig, truth: HandPose, frames: list[Observation]
     assert 1000 * float(apart.norm(dim=-1).mean()) < 1.6
 
 
+def test_the_shape_is_told_by_all_frames_however_many_are_added_up_at_once(
+    rig: Rig, truth: HandPose, frames: list[Observation], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    space, shapes = ShapeSpace.around(rig, 1.0, 2), []
+    for count in (64, 3, 1):
+        monkeypatch.setattr(solver, "_ADDED", count)
+        descent = _descent(rig.shaped(), frames, spoilt(truth, 3.0), 3.0, space)
+        descent.step_shape(Look(0.7, 3.0), 1)
+        shapes.append(descent.shared)
+    assert float(shapes[0].abs().max()) > 0.01
+    for other in shapes[1:]:
+        torch.testing.assert_close(other, shapes[0], rtol=1e-3, atol=1e-5)
+
+
+def test_poses_alone_are_linearised_as_among_shared_unknowns(
+    rig: Rig, truth: HandPose, frames: list[Observation]
+) -> None:
+    space = ShapeSpace.around(rig, 1.0, 2)
+    descent = _descent(rig.shaped(), frames, spoilt(truth, 3.0), 3.0, space)
+    look = Look(0.7, 3.0)
+    alone, both = (
+        descent._linearised(look, descent.poses, *shared) for shared in ((), (descent.shared,))
+    )
+    assert alone.mixed.shape[-1] == 0 < both.mixed.shape[-1] and bool(both.curvature.any())
+    assert torch.equal(alone.energies, both.energies)
+    torch.testing.assert_close(alone.blocks, both.blocks, rtol=1e-4, atol=1.0)
+    torch.testing.assert_close(alone.gradient, both.gradient, rtol=1e-4, atol=1e-2)
+
+
 @pytest.fixture(scope="module")
 def blank(frames: list[Observation]) -> list[Observation]:
     """The frames, of which nothing is known."""
