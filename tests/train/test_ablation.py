@@ -64,7 +64,6 @@ def test_rows_are_named_after_what_they_are_compared_with() -> None:
     assert [name for name, row in ROWS.items() if not row.against] == names[:1]
 
 
-@pytest.mark.slow
 def test_a_view_shaded_whole_is_what_the_avatar_renders(made: Path) -> None:
     """The samples that stay are those of a picture with one ray per pixel."""
     from handavatar.avatar import HandAvatar, RenderSettings
