@@ -24,17 +24,16 @@ import signal
 import sys
 import tempfile
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from conftest import TINY, coarse_skin, write_tiny_capture
+from conftest import TINY, make_hand_film, write_tiny_capture
 from stop_anywhere import contents
 
 from handavatar.cli import main
-from handavatar.synthetic.films import FilmOptions, make_film
 from handavatar.train.loop import METHODS, TrainOptions, train
 
 
@@ -97,27 +96,12 @@ def copy(source: Path, target: Path) -> None:
     (shutil.copytree if source.is_dir() else shutil.copy2)(source, target)
 
 
-def small_film(folder: Path) -> Path:
-    """A made video of nine pictures of a hand."""
-    options = FilmOptions("hand", 21, 0.2, ("spread", "relaxed"), width=320, height=240, fps=10.0)
-    with coarse_skin():
-        return make_film(replace(options, seconds=0.9, distance=0.36, crf=12), folder)
-
-
 def jobs(room: Path, capture: Path, avatar: Path, film: Path) -> list[Job]:
     """All commands that replace."""
     video = ["capture", "video", str(film), "--out", str(room / "video"), "--overwrite"]
     # Every stage, in few steps.
-    video += [
-        "--tracker",
-        "own",
-        "--fit.landmark-steps",
-        "8",
-        "--fit.outline-steps",
-        "4",
-        "--fit.retry-steps",
-        "1",
-    ]
+    video += ["--tracker", "own", "--fit.landmark-steps", "8", "--fit.outline-steps", "4"]
+    video += ["--fit.retry-steps", "1"]
     video += ["--register.tilts", "--register.restarts", "0", "--register.texture-rounds", "1"]
     video += ["--register.texture-sigmas", "3", "--register.no-is-wide"]
     synth = ["capture", "synth", "--size", "32", "--test-frames", "1", "--samples", "2"]
@@ -280,16 +264,16 @@ def kill_all(count: int, seed: int, only: str = "") -> bool:
             )
         for name in ("mine.tmp", "mine.unfinished", "mine"):
             (top / "room" / name).write_text(name)
-        todo = jobs(
-            *(top / "room", capture, trained / "avatar.safetensors", small_film(top / "film"))
-        )
+        film = make_hand_film(top / "film", 0.9)
+        todo = jobs(top / "room", capture, trained / "avatar.safetensors", film)
         todo = [job for job in todo if re.search(only, job.name)]
-        each = -(-count // (len(todo) + bool(re.search(only, "train"))))
+        is_trained = bool(re.search(only, "train"))
+        each = -(-count // (len(todo) + is_trained))
         for job in todo:
             score = killed(job, each, draw)
             is_right &= not score.wrong
             print(json.dumps({"command": job.name} | vars(score)), flush=True)
-        if re.search(only, "train"):
+        if is_trained:
             score = killed_training(top / "training", capture, each, draw)
             is_right &= not score.wrong
             print(json.dumps({"command": "train"} | vars(score)), flush=True)

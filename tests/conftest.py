@@ -182,15 +182,19 @@ def small_film(film_folder: Path) -> FilmTruth:
     return read_film_truth(film_folder / "small.mp4")
 
 
+def make_hand_film(folder: Path, seconds: float) -> Path:
+    """A made film of a hand, ten pictures a second, large enough to find it."""
+    options = FilmOptions(
+        "hand", 21, 0.2, ("spread", "relaxed"), width=320, height=240, seconds=seconds, fps=10.0
+    )
+    with coarse_skin():
+        return make_film(replace(options, distance=0.36, crf=12), folder)
+
+
 @pytest.fixture(scope="session")
 def hand_film_path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A made film of five pictures, large enough for a webcam's page; read only."""
-    options = FilmOptions(
-        "hand", 21, 0.2, ("spread", "relaxed"), width=320, height=240, seconds=0.5, fps=10.0
-    )
-    folder = tmp_path_factory.mktemp("hand_film")
-    with coarse_skin():
-        return make_film(replace(options, distance=0.36, crf=12), folder)
+    return make_hand_film(tmp_path_factory.mktemp("hand_film"), 0.5)
 
 
 @pytest.fixture(scope="session")

@@ -66,6 +66,14 @@ def contents(folder: Path) -> dict[str, tuple[int, bytes]]:
     return {str(path): (path.lstat().st_ino, path.read_bytes()) for path in files}
 
 
+def folder_of(path: Path, texts: dict[str, str]) -> Path:
+    """A folder of somebody's files."""
+    path.mkdir()
+    for name, text in texts.items():
+        (path / name).write_text(text)
+    return path
+
+
 def refused(words: str, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
     code = cli.main([*words.replace("RUN", "run").split(), "--out", str(out), *_overwrite(words)])
     said = capsys.readouterr().err
@@ -84,11 +92,8 @@ def _overwrite(words: str) -> list[str]:
 def test_a_folder_of_a_stranger_is_not_replaced(
     words: str, place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    documents = place / "Documents"
-    documents.mkdir()
-    (documents / "letter.txt").write_text("dear")
-    (place / "Documents.unfinished").mkdir()
-    (place / "Documents.unfinished" / "f").write_text("hi")
+    documents = folder_of(place / "Documents", {"letter.txt": "dear"})
+    folder_of(place / "Documents.unfinished", {"f": "hi"})
     before = contents(place)
     said = refused(words, documents, capsys)
     assert "Documents" in said
@@ -99,10 +104,7 @@ def test_a_folder_of_a_stranger_is_not_replaced(
 def test_a_scene_a_run_and_the_place_itself_are_not_replaced(
     words: str, place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scene = place / "scene"
-    scene.mkdir()
-    (scene / "transforms.json").write_text("{}")
-    (scene / "notes").write_text("hi")
+    scene = folder_of(place / "scene", {"transforms.json": "{}", "notes": "hi"})
     before = contents(place)
     for out in (scene, place / "run", place, Path(".")):
         if (words, out) != ("evaluate RUN --capture capture", place / "run"):
@@ -116,9 +118,7 @@ def test_a_folder_or_a_link_is_no_file_to_be_replaced(
 ) -> None:
     kinds = [word for word in words.split() if word in ENDINGS]
     ending = ENDINGS[kinds[0]] if kinds else ""
-    folder = place / f"folder{ending}"
-    folder.mkdir()
-    (folder / "letter.txt").write_text("dear")
+    folder = folder_of(place / f"folder{ending}", {"letter.txt": "dear"})
     (place / f"there{ending}").write_text("mine")
     link = place / f"link{ending}"
     link.symlink_to(place / f"there{ending}")

@@ -200,10 +200,18 @@ class RenderSettings:
 
     def __post_init__(self) -> None:
         """Refuses numbers that are out of range."""
-        counts = {"num_samples": 4096, "coarse": 4096, "group": 4096, "edge_rays": 64}
-        require_ranges(self, **{name: (1, most) for name, most in counts.items()})
-        require_ranges(self, rays_at_once=(1, 10**9), mask_margin=(0, math.inf))
-        require_ranges(self, smallest_weight=(0, 1), stop=(0, 1), refine_above=(0, 1))
+        require_ranges(
+            self,
+            num_samples=(1, 4096),
+            coarse=(1, 4096),
+            group=(1, 4096),
+            edge_rays=(1, 64),
+            rays_at_once=(1, 10**9),
+            mask_margin=(0, math.inf),
+            smallest_weight=(0, 1),
+            stop=(0, 1),
+            refine_above=(0, 1),
+        )
 
 
 EXACT = RenderSettings(smallest_weight=1e-7, stop=1e-7, coarse=1, mask_margin=math.inf)

@@ -1,8 +1,7 @@
 """Edits of a finished avatar's look: a value that rendering takes, no training needed."""
 
-import math
 from dataclasses import dataclass, replace
-from numbers import Integral, Real
+from numbers import Integral
 
 import torch
 from jaxtyping import Float
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from handavatar.errors import ArgumentError
 from handavatar.field.anchors import Neighbours
-from handavatar.geometry.tensors import require_tensor, require_type
+from handavatar.geometry.tensors import is_finite_number, require_tensor, require_type
 from handavatar.hand.pose import BONE_NAMES, FINGER_BONES, NUM_BONES
 
 
@@ -69,11 +68,11 @@ class Edit:
 
     def __post_init__(self) -> None:
         """Refuses what is no edit."""
-        if not (_is_number(self.light_gain) and self.light_gain >= 0):
+        if not (is_finite_number(self.light_gain) and self.light_gain >= 0):
             raise ArgumentError("light_gain", str(self.light_gain)[:60], "a number, at least 0")
         shift = self.albedo_shift
         is_triple = isinstance(shift, tuple | list) and len(shift) == 3
-        if not (is_triple and all(_is_number(value) for value in shift)):
+        if not (is_triple and all(is_finite_number(value) for value in shift)):
             raise ArgumentError("albedo_shift", str(shift)[:60], "three numbers: red, green, blue")
         bones = self.lifted_bones
         is_list = isinstance(bones, tuple | list)
@@ -138,10 +137,6 @@ class Edit:
         if not self.lifted_bones:
             return directed
         return directed.index_fill(-1, torch.tensor(self.lifted_bones, device=directed.device), 0.0)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, Real) and math.isfinite(value)
 
 
 def bones_named(names: tuple[str, ...]) -> tuple[int, ...]:

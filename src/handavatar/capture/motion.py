@@ -189,7 +189,7 @@ class Motion:
 
     def __post_init__(self) -> None:
         """Refuses what is no motion."""
-        require_ranges(self, fps=(0.01, 1000))
+        require_ranges(self, fps=(_LEAST_FPS, _MOST_FPS))
         require_tensor("Motion.rotations", self.rotations, (-1, NUM_BONES, 3))
         require_tensor("Motion.translations", self.translations, (len(self.rotations), 3))
 

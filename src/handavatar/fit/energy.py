@@ -26,7 +26,7 @@ from handavatar.fit.kinematics import (
 )
 from handavatar.fit.landmarks import LandmarkSightings
 from handavatar.fit.pictures import FramePicture, PictureBand, drawing_camera
-from handavatar.fit.shape import ShapeSpace
+from handavatar.fit.shape import ShapeSpace, fixed_shape
 from handavatar.geometry.cameras import Camera
 from handavatar.geometry.meshes import SurfacePoints, vertex_normals
 from handavatar.hand.landmarks import NUM_LANDMARKS
@@ -141,13 +141,8 @@ class HandPoints:
 
     def with_shared_fixed(self) -> "HandPoints":
         """The same hand without shared unknowns: a pose alone costs a tenth of all together."""
-        space = ShapeSpace(
-            self.space.directions[..., :0],
-            self.space.joint_directions[..., :0],
-            self.space.sigmas[:0],
-        )
         landmarks = replace(self.landmarks, directions=self.landmarks.directions[..., :0])
-        return replace(self, space=space, landmarks=landmarks)
+        return replace(self, space=fixed_shape(self.hand.rig), landmarks=landmarks)
 
 
 def linearise_frame(

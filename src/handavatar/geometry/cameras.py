@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
-from numbers import Integral, Real
+from numbers import Integral
 
 import torch
 from jaxtyping import Float
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from handavatar.errors import ArgumentError
 from handavatar.geometry.rotations import rigid_transform
-from handavatar.geometry.tensors import require_tensor
+from handavatar.geometry.tensors import is_finite_number, require_tensor
 
 _RIGID = 1e-3
 """How far the entries of a rotation times its transpose may be from those of the identity."""
@@ -90,7 +90,7 @@ def _are_two_numbers(value: object) -> bool:
     return (
         isinstance(value, tuple | list)
         and len(value) == 2
-        and all(isinstance(number, Real) and math.isfinite(number) for number in value)
+        and all(is_finite_number(number) for number in value)
     )
 
 

@@ -1,5 +1,8 @@
 """Tensors that a caller hands in: refused by name where they enter, and not where they break."""
 
+import math
+from numbers import Real
+
 import torch
 from torch import Tensor
 
@@ -58,6 +61,15 @@ def require_type(name: str, value: object, kind: type) -> None:
     """
     if not isinstance(value, kind):
         raise ArgumentError(name, _type(value), f"a {kind.__name__}")
+
+
+def is_finite_number(value: object) -> bool:
+    """Whether this is a real number, not NaN, not endless.
+
+    Args:
+        value: that a caller gave.
+    """
+    return isinstance(value, Real) and math.isfinite(value)
 
 
 def _type(value: object) -> str:
