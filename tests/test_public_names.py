@@ -37,7 +37,7 @@ EXACTLY = {
     "edit": "Edit Paint bones_named",
     "avatar": (
         "CheckpointError EXACT HandAvatar HandState RayValues RenderSettings Rendering "
-        "SCHEMA START_LIGHT VisibleSamples chosen_device"
+        "SCHEMA START_LIGHT VisibleSamples chosen_device rendering_seconds"
     ),
     "plain": "plain_rays",
     "capture.default": "default_capture",

@@ -19,7 +19,14 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from handavatar.avatar import EXACT, HandAvatar, Rendering, RenderSettings, chosen_device
+from handavatar.avatar import (
+    EXACT,
+    HandAvatar,
+    Rendering,
+    RenderSettings,
+    chosen_device,
+    rendering_seconds,
+)
 from handavatar.capture.frame_sequence import spread_numbers
 from handavatar.capture.motion import gesture, open_motion
 from handavatar.capture.view import camera_holding, start_of
@@ -156,7 +163,10 @@ def render_motion(options: RenderOptions, progress: Progress = SILENT) -> Path:
                 folder.begin(options.overwrite)
             processes.wait()
             frames, videos = progress.stages(
-                {"frames": 1.0 * len(poses), "videos": 0.03 * len(poses) * len(passes)}
+                {
+                    "frames": rendering_seconds(camera) * len(poses),
+                    "videos": 0.03 * len(poses) * len(passes),
+                }
             ).values()
             for index in range(processes.rank, len(poses), processes.count):
                 files = [f"{name}/{index:06d}.png" for name in passes]

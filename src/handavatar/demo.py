@@ -86,10 +86,8 @@ def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
     run = out / "run"
     claim_folder(out, DEMONSTRATION)
     begin = time.monotonic()
-    frames = float(options.frames)
-    stages = progress.stages(
-        {"training": 300.0, "judging": 40.0, "a video": 1.0 * frames, "edits": 5.0}
-    )
+    frames = 1e-4 * options.size**2 * options.frames
+    stages = progress.stages({"training": 400.0, "judging": 180.0, "a video": frames, "edits": 8.0})
     _say("1/4 training on the shipped capture", begin)
     train(
         TrainOptions(

@@ -8,6 +8,7 @@ import math
 import re
 from collections import Counter
 from io import BytesIO
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -155,18 +156,22 @@ def number(value: object, label: str, low: float = -math.inf, high: float = math
 def numbers(value: object, shape: tuple[int, ...], label: str) -> np.ndarray:
     """Nested lists of finite numbers of a given shape, as float64, or :class:`CaptureError`."""
 
-    def walk(item: object, sizes: tuple[int, ...]) -> Any:
-        if not sizes:
-            return number(item, label)
-        if not isinstance(item, list) or len(item) != sizes[0]:
-            found = f"a list of {len(item)}" if isinstance(item, list) else str(item)[:60]
-            raise CaptureError(
-                f"{label} has {found} where {sizes[0]} entries were expected",
-                f"{label} must be nested lists of shape {list(shape)}",
-            )
-        return [walk(each, sizes[1:]) for each in item]
-
-    return np.array(walk(value, shape), dtype=np.float64)
+    items = [value]
+    for size in shape:
+        for item in items:
+            if not isinstance(item, list) or len(item) != size:
+                found = f"a list of {len(item)}" if isinstance(item, list) else str(item)[:60]
+                raise CaptureError(
+                    f"{label} has {found} where {size} entries were expected",
+                    f"{label} must be nested lists of shape {list(shape)}",
+                )
+        items = list(chain.from_iterable(items))  # type: ignore[arg-type]
+    # Floats within bounds are most of what is read.
+    checked = [
+        item if type(item) is float and -1e300 < item < 1e300 else number(item, label)
+        for item in items
+    ]
+    return np.array(checked, dtype=np.float64).reshape(shape)
 
 
 def text_field(content: dict[str, Any], key: str, choices: tuple[str, ...] = ()) -> str:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from handavatar.avatar import HandAvatar, Rendering, chosen_device
+from handavatar.avatar import HandAvatar, Rendering, chosen_device, rendering_seconds
 from handavatar.capture.checks import decoded, load_json, open_picture
 from handavatar.capture.frame_sequence import spread_numbers
 from handavatar.capture.frames import (
@@ -156,19 +156,20 @@ def evaluate_run(options: EvaluateOptions, progress: Progress = SILENT) -> dict[
     inputs = (options.run, capture.folder)
     refuse_folder_in_use(out, EVALUATION, True, inputs)
     count, is_tracked = len(indices), capture.is_tracked
-    stages = progress.stages(
-        {
-            "poses": 2.0 * count if is_tracked else 0.0,
-            "rendering": 1.5 * count,
-            "registered poses": 1.0 * count if is_tracked else 0.0,
-            "rendering again": 1.5 * count if is_tracked else 0.0,
-            "measuring": 2.0 * count,
-            "report": 1.0 * count,
-        }
-    )
     frames = [capture.frame(index) for index in indices]
     if not options.full_size:
         frames = [frame.binned(FITTED_SIDE) for frame in frames]
+    pictures = sum(rendering_seconds(frame.camera) for frame in frames)
+    stages = progress.stages(
+        {
+            "poses": 2.0 * count if is_tracked else 0.0,
+            "rendering": pictures,
+            "registered poses": 1.0 * count if is_tracked else 0.0,
+            "rendering again": pictures if is_tracked else 0.0,
+            "measuring": 1.0 * count,
+            "report": 0.5 * count,
+        }
+    )
     protocols = _protocols(avatar, frames, is_tracked, stages)
     stages["measuring"](0.0)
     metrics = _measured(options, capture, avatar, frames, protocols)

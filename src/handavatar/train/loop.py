@@ -445,7 +445,7 @@ def stage_seconds(method: Method, steps: int, count: int, is_corrected: bool) ->
         "outlines": 0.03 * method.outline_rounds * method.outline_visits * count,
         "occupancy": 0.2 * count + 0.13 * method.personal_steps if method.personal_steps else 0.0,
         "border": 0.11 * count + 0.55 * method.border_steps if method.border_steps else 0.0,
-        "samples": (4.5 if has_light else 2.0) * count if method.warm_steps else 0.0,
+        "samples": (3.5 if has_light else 0.6) * count if method.warm_steps else 0.0,
         "train": _WARM_STEP * warm + _JOINT_STEP * method.frames * (steps - warm),
         "detail": 0.5 * count + 0.06 * method.detail_steps if method.detail_size else 0.0,
         "saving": 2.0,
