@@ -1,6 +1,7 @@
 """The demonstration, from the shipped capture to the edited picture, on a budget of steps."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from PIL import Image
 
 from handavatar import demo
 from handavatar.avatar import HandAvatar
+from handavatar.capture.default import default_capture
+from handavatar.capture.frames import Capture, read_capture
 from handavatar.demo import DemoOptions, run_demo
 from handavatar.train.loop import METHODS
 
@@ -22,15 +25,31 @@ def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["precious.txt"]
 
 
+def _shorter(folder: Path, out: Path, counts: dict[str, int]) -> Capture:
+    """A copy of a capture with so many frames of each split."""
+    shutil.copytree(folder, out)
+    header = json.loads((out / "transforms.json").read_text())
+    header["frames"] = [
+        frame
+        for split, count in counts.items()
+        for frame in [one for one in header["frames"] if one["split"] == split][:count]
+    ]
+    (out / "transforms.json").write_text(json.dumps(header))
+    return read_capture(out)
+
+
 @pytest.mark.slow
 def test_the_demonstration_leaves_everything_it_promises(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # Its method on a tenth of the budget before the first step, which `steps` does not shorten.
+    # Its method on a tenth of the budget before the first step, which `steps` does not shorten,
+    # and a part of the frames.
     quick = replace(
         METHODS["quick"], personal_steps=60, border_steps=45, detail_size=128, detail_steps=20
     )
     monkeypatch.setitem(METHODS, "quick", quick)
+    shorter = _shorter(default_capture().folder, tmp_path / "capture", {"train": 12, "test": 2})
+    monkeypatch.setattr(demo, "default_capture", lambda: shorter)
     evaluate = demo.evaluate_run
     monkeypatch.setattr(demo, "evaluate_run", lambda o, p: evaluate(replace(o, max_frames=1), p))
     out = run_demo(DemoOptions(tmp_path / "out", steps=4, frames=2, size=32, device="cpu"))
