@@ -57,9 +57,11 @@ from handavatar.hand.pose import HandPose
 from handavatar.hand.rigs import read_rig
 from handavatar.hand.skin_refinement import strongest_bones
 from handavatar.hand.sparse_skin import SparseSkin
+from handavatar.jobs.stage_states import StageStates, WorkState
 from handavatar.retouch import paint_from
 from handavatar.synthetic.truth import encoded_masks, read_film_truth
 from handavatar.tracker.model import read_tracker
+from handavatar.train.kept import origin, read_kept, write_kept
 from handavatar.train.live import LiveState, live_folder, read_live
 from handavatar.train.prior import SHIPPED_PRIOR, open_prior
 from handavatar.train.runs import (
@@ -145,6 +147,30 @@ def _mask(folder: Path, avatar: HandAvatar) -> Format:
         read_capture(capture).frame(0)
 
     return Format(capture / "masks/000000.png", changed_bytes, read)
+
+
+def _stage_state(folder: Path, avatar: HandAvatar) -> Format:
+    def states() -> StageStates:
+        return StageStates(folder / "work", "a work", ("first", "second"))
+
+    state = WorkState({"poses": torch.rand(4, 16, 3), "order": torch.arange(4)}, {"rounds": 2})
+    states().begin("second", lambda: state)
+
+    def read() -> None:
+        # It is what was written, or the work is begun anew.
+        found = states().whole
+        if found is not None:
+            assert found.facts == state.facts and found.tensors.keys() == state.tensors.keys()
+            assert all(torch.equal(found.tensors[n], v) for n, v in state.tensors.items())
+
+    return Format(folder / "work.safetensors", changed_tensors, read)
+
+
+def _kept_figures(folder: Path, avatar: HandAvatar) -> Format:
+    file = folder / "figures.json"
+    rows = {"quick": [24.0, 23.5], "best": [25.0, None]}
+    write_kept(file, {"rows": rows, "steps": 8} | origin("abc", rows))
+    return Format(file, changed_json_bytes, lambda: read_kept(file, "abc", True))
 
 
 def _paint(folder: Path, avatar: HandAvatar) -> Format:
@@ -453,6 +479,8 @@ FORMATS: dict[str, Callable[[Path, HandAvatar], Format | list[Format]]] = {
     "capture": _capture,
     "frame": _frame,
     "mask": _mask,
+    "stage state": _stage_state,
+    "kept figures": _kept_figures,
     "paint": _paint,
     "motion": _motion,
     "another program's motion": _other_motions,

@@ -18,6 +18,7 @@ _FEWER = {"mano": 300}
 FEW = 10
 _QUICK = ("capture", "mask", "motion", "paint", "rig", "run.json", "log.jsonl", "progress.json")
 _QUICK += ("cameras", "given masks", "pictures", "skin", "film truth")
+_QUICK += ("stage state", "kept figures")
 
 
 def _faults(count: int, *names: str) -> dict[str, dict[str, int]]:

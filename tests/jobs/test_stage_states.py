@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
+from safetensors.torch import save_file
 
 from handavatar.jobs import stage_states
 from handavatar.jobs.finite import NotFinite
@@ -109,3 +111,31 @@ def test_who_has_no_place_keeps_nothing() -> None:
         step()
         raise Interrupted
     assert NOT_KEPT.read() is None
+
+
+@pytest.mark.parametrize("is_tensor", [True, False])
+def test_what_was_changed_after_it_was_written_is_begun_anew(
+    is_tensor: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    facts = {"steps": (1, 2), "by number": {10: "ten", 9: "nine"}}
+    tensors = {
+        "none": torch.zeros(0, 3),
+        "one": torch.tensor(True),
+        "half": torch.ones(2, 3, dtype=torch.bfloat16).T,
+        "whole": torch.arange(4),
+    }
+    _states(tmp_path).begin("second", lambda: WorkState(tensors, facts))
+    again = _states(tmp_path).whole
+    assert again is not None and again.facts["by number"] == {"10": "ten", "9": "nine"}
+    assert all(torch.equal(again.tensors[name], values) for name, values in tensors.items())
+    (file,) = tmp_path.iterdir()
+    with safe_open(file, "pt") as opened:
+        header = opened.metadata()
+        found = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    if is_tensor:
+        found["whole"][3] = 4
+    else:
+        header["state"] = header["state"].replace("nine", "none")
+    save_file(found, file, header)
+    assert _states(tmp_path).whole is None
+    assert "it was changed after it was written" in caplog.text

@@ -20,7 +20,13 @@ from handavatar.peers.table import PeersTableOptions, peers_table
 from handavatar.train import ablation_table as ablation
 from handavatar.train import kept
 from handavatar.train.ablation_table import AblationTableOptions, ablation_table
-from handavatar.train.kept import capture_fingerprint, origin, present_commit, read_kept
+from handavatar.train.kept import (
+    capture_fingerprint,
+    origin,
+    present_commit,
+    read_kept,
+    write_kept,
+)
 
 DOCS = Path(__file__).parents[2] / "docs"
 KEPT = DOCS / "ablation"
@@ -143,6 +149,17 @@ def test_a_file_that_says_nonsense_is_refused(
     folder = _stamped("light-key.json", tmp_path / "kept", **facts)
     with pytest.raises(CaptureError, match=r"light-key\.json: "):
         _ablation(capture, folder)
+
+
+def test_figures_that_were_changed_after_they_were_written_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "figures.json"
+    figures = {"rows": {"quick": [0.1, 2, None]}, "steps": (1, 2)} | origin("abc", ["quick"])
+    written = write_kept(path, figures)
+    assert read_kept(path, "abc", False) == written and written["steps"] == [1, 2]
+    path.write_text(path.read_text().replace("0.1", "0.2"))
+    with pytest.raises(CaptureError, match=r"figures\.json: its figures were changed") as caught:
+        read_kept(path, "abc", True)
+    assert "move this file away" in str(caught.value)
 
 
 def test_an_installed_copy_goes_by_its_version(monkeypatch: pytest.MonkeyPatch) -> None:

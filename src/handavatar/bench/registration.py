@@ -69,11 +69,16 @@ from handavatar.geometry.cameras import Camera
 from handavatar.hand.pose import HandPose
 from handavatar.hand.rig import Rig, ShapedHand
 from handavatar.hand.rigs import find_rig
-from handavatar.jobs.files import write_atomically
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.synthetic.films import FILMS, make_film
 from handavatar.synthetic.truth import FilmTruth, read_film_truth
-from handavatar.train.kept import capture_fingerprint, origin, origin_notes, read_kept
+from handavatar.train.kept import (
+    capture_fingerprint,
+    origin,
+    origin_notes,
+    read_kept,
+    write_kept,
+)
 from handavatar.train.loop import METHODS, TrainOptions, begin_training
 from handavatar.train.outlines import corrected_pose, fit_outlines
 from handavatar.train.provenance import folder_sha256
@@ -249,9 +254,7 @@ class _Results:
         scores = measure()
         if scores is not None:
             content = {"figures": dict(scores.figures), "of_frames": list(scores.of_frames)}
-            content |= origin(sha256, content)
-            text = json.dumps(content, indent=1, allow_nan=False)
-            write_atomically({path: text.encode()})
+            write_kept(path, content | origin(sha256, content))
         return scores
 
 

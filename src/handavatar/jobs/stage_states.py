@@ -2,7 +2,8 @@
 
 The work is a row of stages. ``NAME.safetensors`` holds the state of the whole where a stage began;
 ``NAME.stage.safetensors`` what that stage says of itself, when the work is told to stop and now and
-then. Both are written aside first, and only if all of it is finite.
+then. Both are written aside first, and only if all of it is finite; who reads them compares what is
+in them with what was written.
 """
 
 import json
@@ -11,10 +12,12 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import safetensors.torch
+import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
@@ -155,11 +158,12 @@ class StageStates:
 
     def _write(self, path: Path, name: str, state: WorkState) -> None:
         require_finite({**state.tensors, "facts": state.facts}, f"stage {name}: not kept")
-        record = {"fingerprint": self._fingerprint, "name": name, "facts": state.facts}
-        text = json.dumps(record, allow_nan=False)
         tensors = {
             key: value.detach().cpu().contiguous().clone() for key, value in state.tensors.items()
         }
+        facts = json.loads(json.dumps(state.facts, allow_nan=False))  # As they will be read.
+        record = {"fingerprint": self._fingerprint, "name": name, "facts": facts}
+        text = json.dumps(record | {"sha256": _digest(tensors, record)})
         write_atomically({path: safetensors.torch.save(tensors, {"state": text})})
 
     def remove(self) -> None:
@@ -179,6 +183,15 @@ def state_files(path: Path) -> tuple[Path, Path]:
     )
 
 
+def _digest(tensors: Mapping[str, Tensor], record: Json) -> str:
+    """Of all that a file holds beside this."""
+    digest = sha256(json.dumps(record, sort_keys=True).encode())
+    for name, values in sorted(tensors.items()):
+        digest.update(f"{name} {values.dtype} {tuple(values.shape)}".encode())
+        digest.update(values.reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
 def _read_state(path: Path, expected: Json) -> WorkState | None:
     """A state whose facts are those that are expected; None, with a warning, where it is not."""
     if not path.is_file():
@@ -186,6 +199,7 @@ def _read_state(path: Path, expected: Json) -> WorkState | None:
     try:
         with safe_open(path, "pt") as file:
             record = json.loads(file.metadata()["state"])
+            written = record.pop("sha256")
             # Cloned: products of matrices are rounded otherwise where memory begins elsewhere.
             tensors = {name: file.get_tensor(name).clone() for name in file.keys()}  # noqa: SIM118
         if {key: record[key] for key in expected} != expected:
@@ -193,6 +207,8 @@ def _read_state(path: Path, expected: Json) -> WorkState | None:
             return None
         if not isinstance(record["name"], str) or not isinstance(record["facts"], dict):
             raise ValueError("its facts are no state's")
+        if written != _digest(tensors, record):
+            raise ValueError("it was changed after it was written")
         if found := find_not_finite({**tensors, "facts": record}):
             raise ValueError(found)
     except (OSError, ValueError, KeyError, TypeError, RecursionError, SafetensorError) as error:

@@ -1,6 +1,5 @@
 """``handavatar bench --table peers``: prior art and ours on the same frames and the same hand."""
 
-import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,9 +29,14 @@ from handavatar.train.ablation import (
     trained_shading,
     view_of_frame,
 )
-from handavatar.train.kept import capture_fingerprint, origin, origin_notes, read_kept
+from handavatar.train.kept import (
+    capture_fingerprint,
+    origin,
+    origin_notes,
+    read_kept,
+    write_kept,
+)
 from handavatar.train.loop import METHODS
-from handavatar.train.runs import write_json
 
 OURS = {"ours (paper)": "+ directed occupancy (paper)", "ours (best)": "traced light"}
 PEERS = ("textured mesh", "inverse skinning")
@@ -102,9 +106,8 @@ def peers_table(options: PeersTableOptions, progress: Progress = SILENT) -> Resu
         else:
             rows = _measured(folder, options, finished)
             found = about | {"capture": folder.name, "rows": rows} | origin(sha256, rows)
-            found = json.loads(json.dumps(found))
             make_folder(options.kept, TABLES)
-            write_json(path, found)
+            found = write_kept(path, found)
         measured.append(found)
     return _table(measured, options)
 

@@ -1,6 +1,5 @@
 """``handavatar bench --table ablation``: what each part of the shading and the shape is worth."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +21,8 @@ from handavatar.train.kept import (
     origin_notes,
     read_kept,
     require_known_origin,
+    write_kept,
 )
-from handavatar.train.runs import write_json
 
 
 @dataclass(frozen=True)
@@ -110,9 +109,8 @@ def ablation_table(options: AblationTableOptions, progress: Progress = SILENT) -
             found["seeds"] = list(options.seeds)
             found |= origin(sha256, missing)
             found["commits"] = {**kept.get("commits", {}), **found["commits"]}
-            kept = json.loads(json.dumps(found))
             make_folder(options.kept, TABLES)
-            write_json(path, kept)
+            kept = write_kept(path, found)
         measured.append(kept)
     return table_of(measured, options)
 

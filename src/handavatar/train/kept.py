@@ -6,8 +6,10 @@ so are those of another commit, unless they are asked for: then the table says w
 files by versions that recorded neither, the table says that.
 """
 
+import json
 from collections.abc import Iterable, Mapping
 from functools import cache
+from hashlib import sha256 as hash_of
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +17,11 @@ from handavatar import __version__
 from handavatar.capture.checks import CaptureError, load_json
 from handavatar.capture.frames import COVARIANCES, LANDMARKS
 from handavatar.train.provenance import folder_sha256, source_commit
+from handavatar.train.runs import write_json
 
 _OF_A_CAPTURE = ("transforms.json", "images", "masks", "known", "truth", COVARIANCES, LANDMARKS)
 _SHORT = 12
+_DIGEST = "figures_sha256"
 _ANEW = "name another folder for what is kept, or move this file away, to measure anew"
 
 
@@ -69,6 +73,8 @@ def read_kept(path: Path, sha256: str, any_commit: bool) -> dict[str, Any]:
             f"the capture given is {sha256[:_SHORT]}",
             _ANEW,
         )
+    if _DIGEST in kept and kept[_DIGEST] != _digest(kept):
+        raise CaptureError(f"{path}: its figures were changed after they were written", _ANEW)
     others = sorted({str(commit) for commit in commits.values()} - {present_commit()})
     if others and not any_commit:
         raise CaptureError(
@@ -77,6 +83,27 @@ def read_kept(path: Path, sha256: str, any_commit: bool) -> dict[str, Any]:
             f"give `any_commit=True` to see them as they are, or {_ANEW}",
         )
     return kept
+
+
+def write_kept(path: Path, figures: Mapping[str, Any]) -> dict[str, Any]:
+    """Writes figures with what tells whether they are still the same when they are read.
+
+    Args:
+        path: of the file.
+        figures: with their origin, JSON.
+
+    Returns:
+        What :func:`read_kept` gives.
+    """
+    kept = json.loads(json.dumps(dict(figures), allow_nan=False))
+    kept[_DIGEST] = _digest(kept)
+    write_json(path, kept)
+    return kept
+
+
+def _digest(kept: Mapping[str, Any]) -> str:
+    figures = {name: value for name, value in kept.items() if name != _DIGEST}
+    return hash_of(json.dumps(figures, sort_keys=True).encode()).hexdigest()
 
 
 def require_known_origin(path: Path, kept: Mapping[str, Any]) -> None:
