@@ -24,6 +24,7 @@ from handavatar.capture.frames import read_capture
 from handavatar.geometry.cameras import Camera
 from handavatar.synthetic.films import FilmOptions, make_film
 from handavatar.synthetic.truth import FilmTruth
+from handavatar.train.kept import write_kept
 
 
 def test_true_poses_are_found_to_be_true(tiny_capture: Path) -> None:
@@ -75,12 +76,12 @@ def test_noise_is_told_row_by_row(
     # Of another commit, or of another capture of that name, it is refused.
     kept = tmp_path / "noise5-tiny-0-tracked.json"
     content = json.loads(kept.read_text())
-    kept.write_text(json.dumps(content | {"commits": {"figures": "0123abcd"}}))
+    write_kept(kept, content | {"commits": {"figures": "0123abcd"}})
     with pytest.raises(CaptureError, match="measured by commit 0123abcd"):
         registration_table(options)
     shown = registration_table(replace(options, any_commit=True))
     assert shown.record() == table.record() and "commit 0123abcd" in shown.notes[-1]
-    kept.write_text(json.dumps(content | {"capture_sha256": "0" * 64}))
+    write_kept(kept, content | {"capture_sha256": "0" * 64})
     with pytest.raises(CaptureError, match="are of another capture"):
         registration_table(options)
 
