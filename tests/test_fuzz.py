@@ -17,8 +17,8 @@ _FEWER = {"mano": 300}
 """Of large files, which take a fifth of a second each."""
 FEW = 10
 _QUICK = ("capture", "mask", "motion", "paint", "rig", "run.json", "log.jsonl", "progress.json")
-_QUICK += ("cameras", "given masks", "pictures", "skin", "film truth")
-_QUICK += ("stage state", "kept figures")
+_QUICK += ("cameras", "given masks", "pictures", "skin", "film truth", "stage state")
+_QUICK += ("kept figures",)
 
 
 def _faults(count: int, *names: str) -> dict[str, dict[str, int]]:

@@ -164,7 +164,7 @@ def render_motion(options: RenderOptions, progress: Progress = SILENT) -> Path:
             processes.wait()
             frames, videos = progress.stages(
                 {
-                    "frames": rendering_seconds(camera) * len(poses),
+                    "frames": rendering_seconds(camera.width, camera.height) * len(poses),
                     "videos": 0.03 * len(poses) * len(passes),
                 }
             ).values()

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from handavatar.animate import PICTURES, RenderOptions, pass_pictures, render_motion
-from handavatar.avatar import HandAvatar
+from handavatar.avatar import HandAvatar, rendering_seconds
 from handavatar.capture.default import default_capture
 from handavatar.edit import Edit, bones_named
 from handavatar.errors import SEEDS, require_ranges
@@ -86,8 +86,8 @@ def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
     run = out / "run"
     claim_folder(out, DEMONSTRATION)
     begin = time.monotonic()
-    frames = 1e-4 * options.size**2 * options.frames
-    stages = progress.stages({"training": 400.0, "judging": 180.0, "a video": frames, "edits": 8.0})
+    video = rendering_seconds(options.size, options.size) * options.frames
+    stages = progress.stages({"training": 400.0, "judging": 180.0, "a video": video, "edits": 8.0})
     _say("1/4 training on the shipped capture", begin)
     train(
         TrainOptions(

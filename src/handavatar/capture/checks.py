@@ -166,11 +166,7 @@ def numbers(value: object, shape: tuple[int, ...], label: str) -> np.ndarray:
                     f"{label} must be nested lists of shape {list(shape)}",
                 )
         items = list(chain.from_iterable(items))  # type: ignore[arg-type]
-    # Floats within bounds are most of what is read.
-    checked = [
-        item if type(item) is float and -1e300 < item < 1e300 else number(item, label)
-        for item in items
-    ]
+    checked = [number(item, label) for item in items]
     return np.array(checked, dtype=np.float64).reshape(shape)
 
 

@@ -159,7 +159,8 @@ def evaluate_run(options: EvaluateOptions, progress: Progress = SILENT) -> dict[
     frames = [capture.frame(index) for index in indices]
     if not options.full_size:
         frames = [frame.binned(FITTED_SIDE) for frame in frames]
-    pictures = sum(rendering_seconds(frame.camera) for frame in frames)
+    cameras = [frame.camera for frame in frames]
+    pictures = sum(rendering_seconds(camera.width, camera.height) for camera in cameras)
     stages = progress.stages(
         {
             "poses": 2.0 * count if is_tracked else 0.0,

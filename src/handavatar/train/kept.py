@@ -6,10 +6,10 @@ so are those of another commit, unless they are asked for: then the table says w
 files by versions that recorded neither, the table says that.
 """
 
+import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from functools import cache
-from hashlib import sha256 as hash_of
 from pathlib import Path
 from typing import Any
 
@@ -103,7 +103,7 @@ def write_kept(path: Path, figures: Mapping[str, Any]) -> dict[str, Any]:
 
 def _digest(kept: Mapping[str, Any]) -> str:
     figures = {name: value for name, value in kept.items() if name != _DIGEST}
-    return hash_of(json.dumps(figures, sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(figures, sort_keys=True).encode()).hexdigest()
 
 
 def require_known_origin(path: Path, kept: Mapping[str, Any]) -> None:

@@ -427,6 +427,13 @@ _WARM_STEP, _JOINT_STEP = 0.25, 2.2
 """Usual seconds of a step of the appearance alone, and of a frame of the other steps."""
 
 
+def _samples_seconds(method: Method, count: int) -> dict[str, float]:
+    """The parts of the stage that finds samples in so many frames, and their usual seconds."""
+    if method.cues.num_directions > 0:
+        return {"samples": 2.7 * count, "light": 1.8 * count}
+    return {"samples": 0.5 * count, "light": 0.0}
+
+
 def stage_seconds(method: Method, steps: int, count: int, is_corrected: bool) -> dict[str, float]:
     """The stages of a training, and how long each usually takes on two cores.
 
@@ -437,7 +444,6 @@ def stage_seconds(method: Method, steps: int, count: int, is_corrected: bool) ->
         is_corrected: whether their poses are learned, too.
     """
     warm = min(method.warm_steps, steps)
-    has_light = method.warm_steps > 0 and method.cues.num_directions > 0
     return {
         "checks": 0.03 * count,
         "frames": 0.02 * count + 2.0,
@@ -445,7 +451,7 @@ def stage_seconds(method: Method, steps: int, count: int, is_corrected: bool) ->
         "outlines": 0.03 * method.outline_rounds * method.outline_visits * count,
         "occupancy": 0.2 * count + 0.13 * method.personal_steps if method.personal_steps else 0.0,
         "border": 0.11 * count + 0.55 * method.border_steps if method.border_steps else 0.0,
-        "samples": (3.5 if has_light else 0.6) * count if method.warm_steps else 0.0,
+        "samples": sum(_samples_seconds(method, count).values()) if method.warm_steps else 0.0,
         "train": _WARM_STEP * warm + _JOINT_STEP * method.frames * (steps - warm),
         "detail": 0.5 * count + 0.06 * method.detail_steps if method.detail_size else 0.0,
         "saving": 2.0,
@@ -845,8 +851,7 @@ def _seen_samples(
 ) -> SeenSamples:
     """Found once; the directions of light are those of the checkpoint, if it has them already."""
     has_light = method.cues.num_directions > 0
-    seconds = {"samples": 2.7 * len(frames), "light": 1.8 * len(frames) if has_light else 0.0}
-    parts = progress.stages(seconds)
+    parts = progress.stages(_samples_seconds(method, len(frames)))
     avatar, corrected = training.avatar, corrected_frames(training, frames)
     settings = RenderSettings(num_samples=method.num_samples)
     directions = _light_directions(training)
