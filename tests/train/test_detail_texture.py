@@ -59,7 +59,7 @@ def test_a_view_is_what_the_avatar_renders(avatar: HandAvatar, frames: list[Fram
     window = (slice(view.top, view.top + height), slice(view.left, view.left + width))
     known = view.is_known & (rendering.alpha[window] > 0.98)
     assert int(known.sum()) > 300
-    found = view.albedo.float() * view.light.float()[..., None]
+    found = view.picture(view.albedo.float() * view.light.float()[:, None])
     assert float((found - rendering.color[window])[known].abs().mean()) < 0.01
     assert torch.equal(view.truth, frame.image[window]) and torch.equal(view.gain, frame.gain)
     assert 0 <= float(view.places.min()) <= float(view.places.max()) <= 1
@@ -102,11 +102,9 @@ def test_a_pattern_on_the_skin_is_unwrapped_where_it_is(
     pattern = (0.3 * torch.sin(40 * places).prod(-1))[..., None].expand(64, 64, 3)
     made = []
     for view in views:
-        color = view.albedo.float() * texture_at(pattern, view.places.flatten(0, 1)).exp().view_as(
-            view.albedo
-        )
-        color = (255 * color * view.light.float()[..., None]).round().to(torch.uint8)
-        made.append(replace(view, truth=color))
+        color = view.albedo.float() * texture_at(pattern, view.places).exp()
+        color = view.picture(255 * color * view.light.float()[:, None])
+        made.append(replace(view, truth=color.round().to(torch.uint8)))
     found = unwrap_frames(avatar, frames, made)
     assert 0.2 < found.seen_share < 0.8
     seen = found.seen > 1
@@ -174,8 +172,8 @@ def test_the_fine_part_has_no_mean_and_nothing_from_beside_the_known() -> None:
 def test_frames_that_disagree_are_believed_less(frames: list[Frame]) -> None:
     generator = torch.Generator().manual_seed(0)
     texels = torch.randn(16, 16, 3, generator=generator)
-    places = torch.rand(20, 20, 2, generator=generator)
-    said = texture_at(texels, places.flatten(0, 1)).view(20, 20, 3)
+    places = torch.rand(400, 2, generator=generator)
+    said = texture_at(texels, places)
     known = torch.ones(20, 20, dtype=torch.bool)
     camera = frames[0].camera
 

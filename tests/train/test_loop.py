@@ -586,6 +586,7 @@ def test_large_pictures_are_binned_for_all_but_the_detail(
     some = loop._detailed_frames(
         read_capture(write_tiny_capture(tmp_path / "many", "aab", size=96)),
         [capture.frame(0).binned(48)] * 2,
+        [0, 1],
     )
     assert [frame.camera.width for frame in some] == [96, 48]
     assert widths == {"find_seen_samples": {48}, "learn_detail": {96}}

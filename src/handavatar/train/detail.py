@@ -37,7 +37,7 @@ from handavatar.train.optimizer_state import (
     optimizer_tensors,
     restore_optimizer,
 )
-from handavatar.train.unwrap import UnwrapView, unwrap_pictures
+from handavatar.train.unwrap import UnwrapView, known_numbers, unwrap_pictures
 
 PATCH = 64
 """Pixels along a side of what a step compares."""
@@ -70,20 +70,20 @@ class DetailView:
 
     Attributes:
         truth: the picture; grey where nothing is known of it.
+        is_known: pixels that are learned from; only they have what follows, row by row.
         albedo: without the texture.
         light: illumination.
         places: on the chart, (u, v) of what each pixel shows.
-        is_known: pixels that are learned from; all else of the view is zero.
         top: row of the first pixel in the frame.
         left: its column.
         gain: of the picture's red, green and blue, as in :class:`Frame`.
     """
 
     truth: UInt8[Tensor, "height width 3"]
-    albedo: Float[Tensor, "height width 3"]
-    light: Float[Tensor, "height width"]
-    places: Float[Tensor, "height width 2"]
     is_known: Bool[Tensor, "height width"]
+    albedo: Float[Tensor, "known 3"]
+    light: Float[Tensor, "known"]
+    places: Float[Tensor, "known 2"]
     top: int
     left: int
     gain: Float[Tensor, "3"]
@@ -92,6 +92,14 @@ class DetailView:
     def colors(self) -> Float[Tensor, "height width 3"]:
         """The picture's colours at the capture's average exposure, as :attr:`Frame.colors`."""
         return self.truth.float() / 255 / self.gain
+
+    def picture(
+        self, values: Float[Tensor, "known channels"]
+    ) -> Float[Tensor, "height width channels"]:
+        """Values of the known pixels where they are; zero elsewhere."""
+        found = values.new_zeros(*self.is_known.shape, values.shape[-1])
+        found[self.is_known] = values
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,16 +184,17 @@ def _view_of(
     top, left = (int(v.min()) if len(v) else 0 for v in (rows, columns))
     bottom, right = (int(v.max()) + 1 if len(v) else 1 for v in (rows, columns))
     window = (slice(top, bottom), slice(left, right))
-    is_known = is_known[window]
-    places = is_known.new_zeros(*is_known.shape, 2, dtype=torch.float32)
-    lights = is_known.new_zeros(is_known.shape, dtype=torch.float32)
+    # A copy: a window would hold all of the picture that it is cut from.
+    is_known = is_known[window].clone()
+    places, lights = light.new_zeros(len(rows), 2), light.new_zeros(len(rows))
     fragments = Fragments(*(value[window] for value in vars(whole).values()))
     values = torch.cat([vertices, albedo], dim=-1)
     surface = interpolate(
         replace(fragments, face_index=fragments.face_index.clamp_max(len(faces) - 1)), faces, values
     )
+    surface = surface[is_known]
     if len(rows):
-        hits = surface[is_known][:, :3]
+        hits = surface[:, :3]
         around = nearest_anchors(seen, hits, min(4, len(seen)))
         # How far beyond the mesh the pixels in ``seen`` end, along their rays.
         eye = invert_rigid(camera.camera_from_world)[:3, 3]
@@ -195,16 +204,16 @@ def _view_of(
         beyond = depths / whole.depth[y, x] - 1
         beyond = torch.where(beyond.abs() < _LARGEST_GAP, beyond, 0.0)
         values = around.interpolated(torch.stack([light, beyond], dim=-1))
-        lights[is_known] = values[:, 0]
+        lights = values[:, 0]
         points = eye + (hits - eye) * (1 + values[:, 1:])
         near = nearest_anchors(avatar.anchors.positions(vertices), points)
-        places[is_known] = _texture_of(avatar).places(vertices, points, near)
+        places = _texture_of(avatar).places(vertices, points, near)
     return DetailView(
-        truth=frame.shown[window].to(avatar.device),
-        albedo=surface[..., 3:].half(),
+        truth=frame.shown[window].clone().to(avatar.device),
+        is_known=is_known,
+        albedo=surface[:, 3:].half(),
         light=lights.half(),
         places=places,
-        is_known=is_known,
         top=top,
         left=left,
         gain=frame.gain.to(avatar.device),
@@ -335,9 +344,8 @@ def _unwrap_view(avatar: HandAvatar, frame: Frame, view: DetailView) -> UnwrapVi
     pose = frame.pose.to(avatar.device)
     vertices = avatar.personal(pose).posed(pose).vertices.cpu()
     height, width = view.is_known.shape
-    truth, albedo, light = view.colors.cpu(), view.albedo.float().cpu(), view.light.float().cpu()
-    is_known = view.is_known.cpu()
-    rendered = albedo * light[..., None]
+    truth, is_known = view.colors.cpu(), view.is_known.cpu()
+    rendered = view.picture(view.albedo.float() * view.light.float()[:, None]).cpu()
     wanted = truth.clamp_min(_DARKEST).log() - rendered.clamp_min(_DARKEST).log()
     grey = truth.mean(-1)
     # What lies beside the known, the wall or a grey of ours, makes no picture sharper.
@@ -352,7 +360,7 @@ def _unwrap_view(avatar: HandAvatar, frame: Frame, view: DetailView) -> UnwrapVi
     sigma = _FINE * camera.focal[0] / float(depths.mean())
     pixel = camera.width / 256
     return UnwrapView(
-        residual=fine_part(wanted, is_known, sigma),
+        residual=fine_part(wanted, is_known, sigma)[is_known],
         places=view.places.cpu(),
         is_known=is_known,
         camera=camera.cropped(float(view.left), float(view.top), float(width), float(height)),
@@ -375,8 +383,8 @@ def believed_share(residual: Float[Tensor, "size size 3"], views: list[UnwrapVie
     """
     product = square = 0.0
     for view in views:
-        found = texture_at(residual, view.places[view.is_known]).double()
-        product += float((found * view.residual[view.is_known]).sum())
+        found = texture_at(residual, view.places).double()
+        product += float((found * view.residual).sum())
         square += float(found.square().sum())
     return min(max(product / square, 0.0), 1.0) if square > 0 else 0.0
 
@@ -551,13 +559,14 @@ def _patch(
 ) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width 3"]]:
     """The picture with the texture, and the photograph; the same where nothing is known."""
     is_known = view.is_known[window]
-    places = view.places[window][is_known]
+    numbers = known_numbers(view.is_known)[window][is_known]
+    places = view.places[numbers]
     residual = texture_at(start, places)
     for level in levels:
         residual = residual + texture_at(level, places)
-    albedo = detailed(view.albedo[window][is_known].float(), residual)
+    albedo = detailed(view.albedo[numbers].float(), residual)
     truth = view.colors[window]
-    color = albedo * view.light[window][is_known].float()[:, None]
+    color = albedo * view.light[numbers].float()[:, None]
     return truth.masked_scatter(is_known[..., None], color), truth
 
 

@@ -547,9 +547,9 @@ def _learn_detail(
         small = corrected_frames(training, frames)
         stride = _DETAIL_STRIDE * _thinning(len(frames))
         seen = find_seen_samples(avatar, small, settings, stride, parts["samples"])
-    corrected = corrected_frames(training, _detailed_frames(capture, frames))
-    if len(frames) > _MOST_DETAIL_FRAMES:
-        numbers = spread_numbers(len(frames), _MOST_DETAIL_FRAMES)
+    numbers = spread_numbers(len(frames), _MOST_DETAIL_FRAMES)
+    corrected = corrected_frames(training, _detailed_frames(capture, frames, numbers))
+    if len(frames) > len(numbers):
         seen, corrected = samples_of_frames(seen, numbers), choose_frames(corrected, numbers)
     learned = learn_detail(
         avatar,
@@ -576,15 +576,18 @@ def _thinning(num_frames: int) -> int:
     return math.ceil(math.sqrt(max(1.0, num_frames / _SEEN_FRAMES)))
 
 
-def _detailed_frames(capture: Capture, frames: Sequence[Frame]) -> Sequence[Frame]:
+def _detailed_frames(
+    capture: Capture, frames: Sequence[Frame], numbers: Sequence[int]
+) -> Sequence[Frame]:
     """The training frames as the capture stores them; of very many, some stay binned.
 
     Args:
         capture: of the frames.
         frames: as large as training takes them.
+        numbers: of those that have a say in the detail.
     """
     indices = capture.split("train")
-    whole = set(spread_numbers(len(frames), _DETAILED_FRAMES))
+    whole = {numbers[place] for place in spread_numbers(len(numbers), _DETAILED_FRAMES)}
 
     def detailed(number: int, frame: Frame) -> Frame:
         is_large = number in whole and capture.records[indices[number]].camera != frame.camera

@@ -31,18 +31,20 @@ _FRAMES = 24
 """So many frames, those that see a texel best, have a say in its median."""
 _LARGEST = 1.0
 _TEXELS_AT_ONCE = 32768
+_VALUES_AT_ONCE = 150 * _TEXELS_AT_ONCE
+"""Texels times views whose values are held at once by each thread: 16 bytes each."""
 _LEAST = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class UnwrapView:
-    """A picture to unwrap.
+    """A picture to unwrap; of hundreds, only what is known is held.
 
     Attributes:
         residual: logarithm of what the albedo is to be multiplied by, so that the rendered
-            colours are the photograph's.
-        places: where on the chart (u, v) of each pixel is.
-        is_known: pixels whose residual and place mean something.
+            colours are the photograph's; of the known pixels, row by row.
+        places: where on the chart (u, v) each of them is.
+        is_known: pixels that have a residual and a place.
         camera: of these pixels.
         vertices: of the posed fine mesh, metres, world.
         sharpness: of the picture, relative to others.
@@ -50,8 +52,8 @@ class UnwrapView:
         pixel: as many of the view's pixels are one of a picture 256 wide.
     """
 
-    residual: Float[Tensor, "height width 3"]
-    places: Float[Tensor, "height width 2"]
+    residual: Float[Tensor, "known 3"]
+    places: Float[Tensor, "known 2"]
     is_known: Bool[Tensor, "height width"]
     camera: Camera
     vertices: Float[Tensor, "vertices 3"]
@@ -75,10 +77,9 @@ class Unwrapped:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Of one view: weights of faces, their pixels per uv, and from what depth on all is hidden."""
+    """Of one view: weights of faces, and from what depth on all is hidden."""
 
     weights: Float[Tensor, "faces"]
-    pixels_per_uv: Float[Tensor, "faces 2 2"]
     depth: Float[Tensor, "height width"]
 
 
@@ -110,7 +111,8 @@ def unwrap_pictures(
     residual, seen = torch.zeros(count, 3), torch.zeros(count)
     if not views:
         return Unwrapped(residual, seen)
-    seers = mapped(lambda view: _seen_faces(view, faces, corners), views)
+    chart = _ChartFaces.of(corners)
+    seers = mapped(lambda view: _seen_faces(view, faces, chart), views)
     scale = torch.cat([part.weights[part.weights > 0] for part in seers]).mean()
     sharpest = max(max(view.sharpness for view in views), 1e-12)
     smallest = min(view.fit_error for view in views)
@@ -128,10 +130,14 @@ def unwrap_pictures(
         values = torch.zeros(len(views), len(chosen), 3)
         weights = torch.zeros(len(views), len(chosen))
         for number, (view, part, factor) in enumerate(zip(views, seers, factors, strict=True)):
+            if not len(view.places):
+                continue
             facing = (part.weights[chosen] > 0).nonzero()[:, 0]
             on_faces = chosen[facing]
             points = (view.vertices[faces[on_faces]] * barycentric[facing][..., None]).sum(1)
-            found, is_seen = _looked_up(view, part, points, texel_places[facing], on_faces)
+            pixels, _ = project(view.camera, view.vertices)
+            per_uv = chart.pixels_per_uv(pixels[faces[on_faces]], on_faces)
+            found, is_seen = _looked_up(view, part, points, texel_places[facing], per_uv)
             values[number, facing] = found
             weights[number, facing] = factor * part.weights[on_faces] * is_seen
         total = weights.sum(0)
@@ -140,13 +146,20 @@ def unwrap_pictures(
             values = values.gather(0, best[..., None].expand(-1, -1, 3))
         return weighted_median(values, weights), total
 
-    windows = [slice(at, at + _TEXELS_AT_ONCE) for at in range(0, count, _TEXELS_AT_ONCE)]
+    at_once = min(_TEXELS_AT_ONCE, max(_VALUES_AT_ONCE // len(views), 1))
+    windows = [slice(at, at + at_once) for at in range(0, count, at_once)]
     medians = mapped(median_of, windows, progress=progress)
     for window, (value, total) in zip(windows, medians, strict=True):
         is_seen = total > _LEAST
         seen[window] = torch.where(is_seen, total, 0.0)
         residual[window] = torch.where(is_seen[:, None], value.clamp(-_LARGEST, _LARGEST), 0.0)
     return Unwrapped(residual, seen)
+
+
+def known_numbers(is_known: Bool[Tensor, "height width"]) -> Int[Tensor, "height width"]:
+    """How many known pixels come before each, row by row; of the unknown ones 0."""
+    before = is_known.flatten().cumsum(0, dtype=torch.int32).view_as(is_known) - 1
+    return torch.where(is_known, before, 0)
 
 
 def weighted_median(
@@ -160,13 +173,32 @@ def weighted_median(
     return ordered.gather(0, place)[0]
 
 
-def _seen_faces(
-    view: UnwrapView, faces: Int[Tensor, "faces 3"], corners: Float[Tensor, "faces 3 2"]
-) -> _Seen:
+@dataclass(frozen=True, eq=False)
+class _ChartFaces:
+    """The chart's faces: areas, those without any, and texture coordinates to sides."""
+
+    areas: Float[Tensor, "faces"]
+    is_flat: Bool[Tensor, "faces"]
+    sides_per_uv: Float[Tensor, "faces 2 2"]
+
+    @classmethod
+    def of(cls, corners: Float[Tensor, "faces 3 2"]) -> "_ChartFaces":
+        sides = torch.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], dim=-1)
+        areas = (sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).abs() / 2
+        is_flat = areas < 1e-12
+        sides = torch.where(is_flat[:, None, None], torch.eye(2), sides)
+        return cls(areas, is_flat, torch.linalg.inv(sides))
+
+    def pixels_per_uv(
+        self, corner_pixels: Float[Tensor, "points 3 2"], faces: Int[Tensor, "points"]
+    ) -> Float[Tensor, "points 2 2"]:
+        """Of faces whose corners project to these pixels."""
+        first, second, third = corner_pixels.unbind(1)
+        return torch.stack([second - first, third - first], dim=-1) @ self.sides_per_uv[faces]
+
+
+def _seen_faces(view: UnwrapView, faces: Int[Tensor, "faces 3"], chart: _ChartFaces) -> _Seen:
     """Cosine to the fourth times pixels per texel of every face; zero for those that look away."""
-    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    sides = torch.stack([u, v], dim=-1)
-    uv_areas = (sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0]).abs() / 2
     eye = invert_rigid(view.camera.camera_from_world)[:3, 3]
     normals = normalize(face_cross_products(view.vertices, faces), dim=-1)
     away = normalize(eye - view.vertices[faces].mean(1), dim=-1)
@@ -174,19 +206,16 @@ def _seen_faces(
     pixels, _ = project(view.camera, view.vertices)
     first, second, third = pixels[faces].unbind(1)
     along, across = second - first, third - first
-    is_flat = uv_areas < 1e-12
-    sides = torch.where(is_flat[:, None, None], torch.eye(2), sides)
-    per_uv = torch.stack([along, across], dim=-1) @ torch.linalg.inv(sides)
     area = (along[:, 0] * across[:, 1] - along[:, 1] * across[:, 0]).abs() / 2
-    weights = cosine**4 * area / uv_areas.clamp_min(1e-12)
+    weights = cosine**4 * area / chart.areas.clamp_min(1e-12)
     depth = rasterize(view.vertices, faces, view.camera).depth
     # The nearest within a pixel (of 256) around: what is half hidden is not seen.
     reach = max(1, round(view.pixel))
     nearest = -max_pool2d(
         -depth[None, None].clamp_max(1e6), 2 * reach + 1, stride=1, padding=reach
     )[0, 0]
-    weights = torch.where((cosine > _LEAST_COSINE) & ~is_flat, weights, 0.0)
-    return _Seen(weights, per_uv, nearest + _SAME_DEPTH)
+    weights = torch.where((cosine > _LEAST_COSINE) & ~chart.is_flat, weights, 0.0)
+    return _Seen(weights, nearest + _SAME_DEPTH)
 
 
 def _looked_up(
@@ -194,7 +223,7 @@ def _looked_up(
     part: _Seen,
     points: Float[Tensor, "points 3"],
     places: Float[Tensor, "points 2"],
-    faces: Int[Tensor, "points"],
+    pixels_per_uv: Float[Tensor, "points 2 2"],
 ) -> tuple[Float[Tensor, "points 3"], Bool[Tensor, "points"]]:
     """Residuals of points of the mesh, between pixels linear, and whether they are seen there.
 
@@ -206,11 +235,11 @@ def _looked_up(
     pixels = pixels.nan_to_num(-1e6, -1e6, -1e6).clamp(-1e6, 1e6)
     x, y = pixels.floor().long().unbind(-1)
     nearest = y.clamp(0, height - 1) * width + x.clamp(0, width - 1)
-    is_visible = depths < part.depth.flatten()[nearest]
-    away = places - view.places.flatten(0, 1)[nearest]
-    shifted = (
-        torch.stack([x, y], dim=-1) + 0.5 + (part.pixels_per_uv[faces] @ away[..., None])[..., 0]
-    )
+    known = view.is_known.flatten()
+    is_visible = (depths < part.depth.flatten()[nearest]) & known[nearest]
+    number = known_numbers(view.is_known).flatten()
+    away = places - view.places[number[nearest]]
+    shifted = torch.stack([x, y], dim=-1) + 0.5 + (pixels_per_uv @ away[..., None])[..., 0]
     is_visible &= (shifted - pixels).square().sum(-1) < (_LARGEST_SHIFT * view.pixel) ** 2
     pixels = torch.where(is_visible[:, None], shifted, pixels) - 0.5
     lower = pixels.floor()
@@ -220,7 +249,6 @@ def _looked_up(
     x, y = x.clamp(0, width - 2), y.clamp(0, height - 2)
     first = y * width + x
     across, down = share.unbind(-1)
-    known, residual = view.is_known.flatten(), view.residual.flatten(0, 1)
     corner = first[:, None] + torch.tensor([0, 1, width, width + 1])
     weights = torch.stack(
         [
@@ -231,6 +259,7 @@ def _looked_up(
         ],
         dim=1,
     )
-    value = (residual[corner] * weights[..., None]).sum(1)
-    is_known = (known[corner] * weights).sum(1) > _WHOLE
+    weights = weights * known[corner]
+    value = (view.residual[number[corner]] * weights[..., None]).sum(1)
+    is_known = weights.sum(1) > _WHOLE
     return value, is_inside & is_known & is_visible
