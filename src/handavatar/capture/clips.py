@@ -181,11 +181,11 @@ def lay_hand(
     """
     stages = progress.stages(
         {
-            "cutting out the hand": 10.0,
-            "fitting the hand": 5.0,
-            "laying the hand onto the masks": 15.0,
-            "cutting out the hand again": 5.0,
-            "laying the hand onto masks and texture": 15.0,
+            "cutting out the hand": 25.0,
+            "fitting the hand": 4.0,
+            "laying the hand onto the masks": 82.0,
+            "cutting out the hand again": 29.0,
+            "laying the hand onto masks and texture": 73.0,
         }
     )
     parts = stages["cutting out the hand"].equal_parts(len(clips))

@@ -197,7 +197,7 @@ def capture_video(
             pictures are the cause, a folder beside the would-be capture shows them.
     """
     stages = progress.stages(
-        {"finding the hand": 40.0, "laying the hand": 50.0, "cropping": 5.0, "writing": 5.0}
+        {"finding the hand": 30.0, "laying the hand": 350.0, "cropping": 20.0, "writing": 5.0}
     )
     videos = options.of_each_clip()
     if len(videos) > MAX_CLIPS:
