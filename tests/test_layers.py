@@ -24,7 +24,7 @@ MAY_IMPORT = {
         # A hand laid onto pictures.
         "fit": "geometry jobs hand render",
         # The network that sees hands; knows pictures, not videos.
-        "tracker": "geometry jobs hand",
+        "tracker": "geometry jobs hand processes",
         "capture": "geometry jobs hand render fit tracker",
         # A hand before a camera, followed live; knows neither avatars nor pages.
         "webcam": "geometry jobs hand render fit capture tracker",
@@ -48,7 +48,7 @@ MAY_IMPORT = {
             "processes"
         ),
         # Made videos with truth: a subject of the made captures before a background.
-        "synthetic": "geometry jobs hand capture render tracker",
+        "synthetic": "geometry jobs hand capture render tracker processes",
         # Registration against truth; it runs what training begins with, on captures and films.
         "bench": "geometry jobs hand fit capture render evaluate train synthetic",
         # Prior art, for a table alone.

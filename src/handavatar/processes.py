@@ -1,7 +1,7 @@
 """Several processes that share one work: started by ``torchrun``, or one alone."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -44,9 +44,29 @@ class Processes:
         torch.distributed.all_reduce(value, torch.distributed.ReduceOp.MAX)
         return bool(value)
 
+    def average(self, values: Iterable[torch.Tensor]) -> None:
+        """Gives every process the mean of all processes' values; in place.
+
+        Args:
+            values: the same tensors, in the same order, in all of them.
+        """
+        if self.count == 1:
+            return
+        held = list(values)
+        flat = torch.cat([value.flatten() for value in held])
+        torch.distributed.all_reduce(flat)
+        for value, mean in zip(
+            held, (flat / self.count).split([v.numel() for v in held]), strict=True
+        ):
+            value.copy_(mean.view_as(value))
+
     def wait(self) -> None:
         """Until all processes are here."""
         self.any(False)
+
+
+ALONE = Processes(0, 1, "cpu")
+"""One process that shares nothing."""
 
 
 def is_first_process() -> bool:

@@ -11,6 +11,7 @@ import torch
 from conftest import coarse_skin
 from safetensors.torch import load_file, save_file
 from told import Told
+from two_processes import ended, two_begun
 
 from handavatar.capture.checks import CaptureError
 from handavatar.jobs.files import FolderInUse
@@ -59,7 +60,7 @@ def test_a_training_makes_its_pictures_once_and_goes_on(
     assert torch.equal(first.points.vertices, second.points.vertices)
     assert not torch.equal(first.network.at_point, second.network.at_point)
     # From given weights; a rate of nothing leaves them.
-    further = replace(options, start=options.out, out=tmp_path / "f.safetensors", rate=1e-9)
+    further = replace(options, start_from=options.out, out=tmp_path / "f.safetensors", rate=1e-9)
     train_made_tracker(replace(further, steps=1))
     third = read_tracker(further.out)
     torch.testing.assert_close(third.network.at_point, second.network.at_point, atol=1e-4, rtol=0)
@@ -112,6 +113,77 @@ def test_a_training_that_diverges_keeps_the_last_good_state_and_says_how_to_go_o
     save_file(load_file(state_file) | {"network.verdict.bias": torch.full((2,), -inf)}, state_file)
     with pytest.raises(CaptureError, match=r"verdict\.bias holds -inf(.|\n)*without `resume=True`"):
         train_made_tracker(replace(options, resume=True, steps=5))
+
+
+@pytest.mark.slow
+def test_two_processes_keep_equal_weights_share_files_and_stop_together(tmp_path: Path) -> None:
+    """Each makes a file and is taught with its own; the first one writes."""
+    words = ["tracker", "train", "--out", str(tmp_path / "t.safetensors"), "--processes", "1"]
+    words += ["--pictures", str(tmp_path / "pictures"), "--count", "20", "--steps", "4"]
+    codes, text = ended(two_begun([*words, str(tmp_path)], _program(stopped_at=2)))
+    assert codes == [130, 130], text
+    assert sorted(path.name for path in (tmp_path / "pictures").iterdir()) == [
+        "made-000000.safetensors",
+        "made-000001.safetensors",
+    ]
+    assert int(load_file(tmp_path / "t.state")["step"]) == 2
+    codes, text = ended(two_begun([*words, "--resume", str(tmp_path)], _program()))
+    assert codes == [0, 0], text
+    first, second = (load_file(tmp_path / f"weights-{rank}") for rank in range(2))
+    assert len(first) > 50 and all(torch.equal(first[name], second[name]) for name in first)
+    assert read_tracker(tmp_path / "t.safetensors").network.num_points == 85
+    # More processes than files are refused before anything is made.
+    few = [*words, "--overwrite", "--count", "10", str(tmp_path)]
+    codes, text = ended(two_begun(few, _program()))
+    assert codes == [2, 2] and "at least 10 for each" in text, text
+
+
+def _program(stopped_at: int = 0) -> list[str]:
+    """The command with small files; the second process is told to stop in one step.
+
+    Every process leaves its weights in the folder that the last word names.
+    """
+    return [
+        "-c",
+        f"""
+import os, signal, sys
+from functools import partial
+from pathlib import Path
+
+sys.path.insert(0, {str(Path(__file__).parents[1])!r})
+from conftest import coarse_skin
+from safetensors.torch import save_file
+from handavatar import cli
+from handavatar.synthetic import lessons
+from handavatar.tracker.training import TrackerOptions, TrackerTraining
+
+class Here:
+    map = staticmethod(map)
+    def __enter__(self): return self
+    def __exit__(self, *_): pass
+
+lessons.IN_A_FILE = 10
+lessons.TrackerOptions = partial(TrackerOptions, batch=8)
+lessons.ProcessPoolExecutor = lambda *_: Here()
+rank = os.environ["RANK"]
+teach = TrackerTraining.teach
+
+def taught(training, batch):
+    assert len(batch.images) == 4
+    loss = teach(training, batch)
+    if training.step == {stopped_at} and rank == "1":
+        os.kill(os.getpid(), signal.SIGTERM)
+    if training.step == 4:
+        named = training.network.named_parameters()
+        weights = {{name: value.detach().contiguous() for name, value in named}}
+        save_file(weights, Path(sys.argv[-1]) / f"weights-{{rank}}")
+    return loss
+
+TrackerTraining.teach = taught
+with coarse_skin():
+    sys.exit(cli.main(sys.argv[1:-1]))
+""",
+    ]
 
 
 class _Here:

@@ -16,6 +16,7 @@ import handavatar.train.prior as prior
 from handavatar.avatar import CheckpointError
 from handavatar.jobs.signals import Interrupted
 from handavatar.processes import Processes
+from handavatar.synthetic.lessons import TrackerTrainOptions
 from handavatar.train.labelled_poses import LabelledPose, PoseStream
 from handavatar.train.pretraining import begin_prior_run
 from handavatar.train.prior import PriorOptions, train_prior
@@ -143,7 +144,8 @@ def test_torchrun_leaves_our_options_alone() -> None:
     """It reads the words behind the program's name too, and knows its own by their beginnings."""
     from torch.distributed.run import get_args_parser
 
-    for field in fields(PriorOptions):
-        word = "--" + field.name.replace("_", "-")
-        parsed = get_args_parser().parse_args(["-m", "handavatar", "prior", "train", word, "1"])
-        assert parsed.training_script_args == ["prior", "train", word, "1"]
+    for kind, options in (("prior", PriorOptions), ("tracker", TrackerTrainOptions)):
+        for field in fields(options):
+            word = "--" + field.name.replace("_", "-")
+            parsed = get_args_parser().parse_args(["-m", "handavatar", kind, "train", word, "1"])
+            assert parsed.training_script_args == [kind, "train", word, "1"]

@@ -10,7 +10,7 @@ def train(words: list[str], progress: Progress) -> int:
     from handavatar.cli.inputs import TRACKER
     from handavatar.synthetic.lessons import TrackerTrainOptions, train_made_tracker
 
-    options = parse(TrackerTrainOptions, words, "tracker train", reads={"start": TRACKER})
+    options = parse(TrackerTrainOptions, words, "tracker train", reads={"start_from": TRACKER})
     with progress:
         train_made_tracker(options, progress)
     say(f"tracker: {options.out}")

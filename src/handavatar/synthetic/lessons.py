@@ -1,4 +1,7 @@
-"""``handavatar tracker train|evaluate``: makes pictures, teaches the tracker, judges it."""
+"""``handavatar tracker train|evaluate``: makes pictures, teaches the tracker, judges it.
+
+Several processes: ``torchrun --nproc-per-node 2 -m handavatar tracker train --out ...``.
+"""
 
 import os
 import time
@@ -15,12 +18,13 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from handavatar.capture.checks import CaptureError
-from handavatar.errors import SEEDS, raise_if_refused, require_ranges
+from handavatar.errors import SEEDS, ArgumentError, raise_if_refused, require_ranges
 from handavatar.hand.rigs import load_rig
 from handavatar.jobs.files import refuse_file_in_use, write_atomically
 from handavatar.jobs.finite import NotFinite, find_not_finite, require_finite
 from handavatar.jobs.progress import SILENT, Progress
-from handavatar.jobs.signals import is_stopping, unbroken
+from handavatar.jobs.signals import Interrupted, heard_signals, is_stopping, unbroken
+from handavatar.processes import ALONE, Processes, joined_processes
 from handavatar.synthetic.crops import MadeCrops, make_crops
 from handavatar.tracker.measures import TrackerFigures, measure_tracker
 from handavatar.tracker.model import (
@@ -70,7 +74,7 @@ class TrackerTrainOptions:
     """where the network is taught"""
     processes: int = 0
     """that make pictures; 0: one a core"""
-    start: Path | None = None
+    start_from: Path | None = None
     """tracker whose weights are taught further; drawn anew if None"""
     rate: float = 2e-3
     """learning rate at its highest"""
@@ -108,6 +112,9 @@ class TrackerEvaluateOptions:
 def train_made_tracker(options: TrackerTrainOptions, progress: Progress = SILENT) -> TrainedTracker:
     """Makes what pictures are missing, teaches a network, writes it.
 
+    Started by ``torchrun``, the processes share files and the pictures of every step, and keep
+    equal weights; the first one writes. Each normalises by its own part of a step's pictures.
+
     Args:
         options: how it is taught.
         progress: told how far it is.
@@ -119,7 +126,15 @@ def train_made_tracker(options: TrackerTrainOptions, progress: Progress = SILENT
         NotFinite: the loss, a weight or the optimiser's state is no longer finite; it names what,
             in which step, and how to go on.
         TrackerError: the file to start from is no tracker, or one of other points.
+        ArgumentError: fewer files of a thousand pictures than processes.
     """
+    with joined_processes(options.device) as processes, heard_signals():
+        return _taught(options, processes, progress)
+
+
+def _taught(
+    options: TrackerTrainOptions, processes: Processes, progress: Progress
+) -> TrainedTracker:
     state_file = options.out.with_suffix(".state")
     for path in (options.out, state_file):
         refuse_file_in_use(path, options.overwrite or options.resume)
@@ -130,16 +145,20 @@ def train_made_tracker(options: TrackerTrainOptions, progress: Progress = SILENT
     rig = load_rig(RIG)
     points = TrackedPoints.of(rig, NUM_SKIN_POINTS)
     stages = progress.stages({"pictures": 0.02 * options.count, "training": 1.0 * options.steps})
-    files = make_pictures(options, stages["pictures"])
+    files = make_pictures(options, stages["pictures"], processes)
+    processes.wait()  # The others' files may be needed when it goes on with fewer processes.
     torch.manual_seed(options.seed)
     network = HandNetwork(len(points))
-    if options.start is not None:
-        first = read_tracker(options.start)
+    if options.start_from is not None:
+        first = read_tracker(options.start_from)
         if not first.points.are(points):
-            raise TrackerError(f"{options.start}: tells other points of the hand; train it anew")
+            raise TrackerError(
+                f"{options.start_from}: tells other points of the hand; train it anew"
+            )
         network = first.network
     taught = TrackerOptions(rate=options.rate)
-    training = TrackerTraining(network.to(options.device), taught, options.steps, options.seed)
+    network = network.to(processes.device)
+    training = TrackerTraining(network, taught, options.steps, options.seed, processes)
     if options.resume:
         try:
             state = load_file(state_file)
@@ -150,22 +169,29 @@ def train_made_tracker(options: TrackerTrainOptions, progress: Progress = SILENT
             raise CaptureError(
                 f"{state_file} cannot be gone on with ({error})", "train without `resume=True`"
             ) from error
-    lessons = draw_lessons(read_pictures(files), training)
+    own = files[processes.rank :: processes.count]
+    lessons = draw_lessons(read_pictures(own), training)
     saved, written = time.monotonic(), training.step
     stages["training"].skip(training.step, options.steps)
     for batch in lessons:
+        # The processes stop together: at the end of a step.
         with unbroken():
             loss = training.teach(batch)
-        is_saved = time.monotonic() - saved > _SAVED_EVERY or training.step == options.steps
-        is_saved = is_saved or is_stopping()
-        state = training.state() if is_saved else {}
-        if found := find_not_finite({"loss": loss, **state}):
-            raise NotFinite(f"step {training.step}: {found}", _way_from(options, written))
-        if is_saved:
-            with unbroken():
+            is_stopped = processes.any(is_stopping())
+            is_due = time.monotonic() - saved > _SAVED_EVERY or training.step == options.steps
+            is_saved = processes.is_first and (is_due or is_stopped)
+            state = training.state() if is_saved else {}
+            found = find_not_finite({"loss": loss, **state})
+            # All processes end, or those that found nothing would wait for the others for ever.
+            if processes.any(found is not None):
+                found = found or "the loss of another process is not finite"
+                raise NotFinite(f"step {training.step}: {found}", _way_from(options, written))
+            if is_saved:
                 write_atomically({state_file: save(state)})
-            saved, written = time.monotonic(), training.step
+                saved, written = time.monotonic(), training.step
         stages["training"](training.step, options.steps, loss=loss)
+        if is_stopped:  # Another process was told to stop, and this one not.
+            raise Interrupted(f"{state_file}: stopped at step {training.step}; `resume=True`")
     tracker = TrainedTracker(training.taught().cpu(), points)
     record = {
         "pictures": IN_A_FILE * len(files),
@@ -173,7 +199,8 @@ def train_made_tracker(options: TrackerTrainOptions, progress: Progress = SILENT
         "seed": options.seed,
         "options": asdict(taught),
     }
-    save_tracker(options.out, tracker, record)
+    if processes.is_first:
+        save_tracker(options.out, tracker, record)
     return tracker
 
 
@@ -207,8 +234,13 @@ def evaluate_made_tracker(options: TrackerEvaluateOptions) -> TrackerFigures:
 
 
 def draw_lessons(pictures: CropBatch, training: TrackerTraining) -> Iterator[CropBatch]:
-    """Batches up to the last step, every picture once before any comes again."""
-    batch, total = training.options.batch, len(pictures.images)
+    """Batches up to the last step, every picture once before any comes again.
+
+    Args:
+        pictures: of this process.
+        training: in which each process has an equal part of a step's pictures.
+    """
+    batch, total = training.options.batch // training.processes.count, len(pictures.images)
     order = torch.zeros(0, dtype=torch.long)
     while training.step < training.steps:
         if len(order) < batch:
@@ -217,17 +249,35 @@ def draw_lessons(pictures: CropBatch, training: TrackerTraining) -> Iterator[Cro
         yield pictures.chosen(chosen)
 
 
-def make_pictures(options: TrackerTrainOptions, progress: Progress = SILENT) -> list[Path]:
-    """Files of made pictures, of which those that are missing are made."""
+def make_pictures(
+    options: TrackerTrainOptions, progress: Progress = SILENT, processes: Processes = ALONE
+) -> list[Path]:
+    """Files of made pictures, of which those that are missing are made.
+
+    Args:
+        options: how many, and where.
+        progress: told how many are there.
+        processes: that share the work, each on cores of its own.
+
+    Raises:
+        ArgumentError: if there are fewer files than processes.
+    """
     options.pictures.mkdir(parents=True, exist_ok=True)
     seeds = range(options.seed, options.seed + -(-options.count // IN_A_FILE))
     files = [options.pictures / f"made-{seed:06d}.safetensors" for seed in seeds]
-    missing = [(file, seed) for file, seed in zip(files, seeds, strict=True) if not file.is_file()]
+    if len(files) < processes.count:
+        raise ArgumentError(
+            "count",
+            f"{options.count} pictures for {processes.count} processes",
+            f"at least {IN_A_FILE} for each",
+        )
+    own = list(zip(files, seeds, strict=True))[processes.rank :: processes.count]
+    missing = [(file, seed) for file, seed in own if not file.is_file()]
     progress.skip(len(files) - len(missing), len(files))
     if not missing:
         return files
-    processes = options.processes or os.cpu_count() or 1
-    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+    workers = options.processes or os.cpu_count() or 1
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
         for done, _ in enumerate(pool.map(_make_file, *zip(*missing, strict=True)), start=1):
             progress(len(files) - len(missing) + done, len(files))
     return files

@@ -18,10 +18,13 @@ from torch.nn.functional import (
     grid_sample,
 )
 
+from handavatar.processes import ALONE, Processes
 from handavatar.tracker.network import INPUT_SIDE, MAP_SIDE, HandNetwork, Told
 from handavatar.tracker.points import upright_turn
 
 _PLACE_SCALE, _DEPTH_SCALE = 128.0, 20.0
+_NEXT_PROCESS = 1_000_003
+"""By which seeds of processes are apart."""
 _WARM_STEPS, _LEAST_RATE, _SMOOTHING, _LONGEST_GRADIENT = 300, 0.005, 0.998, 5.0
 
 
@@ -182,18 +185,25 @@ class TrackerTraining:
     """
 
     def __init__(
-        self, network: HandNetwork, options: TrackerOptions, steps: int, seed: int = 0
+        self,
+        network: HandNetwork,
+        options: TrackerOptions,
+        steps: int,
+        seed: int = 0,
+        processes: Processes = ALONE,
     ) -> None:
         """Begins.
 
         Args:
-            network: to teach, in place, on its device.
+            network: to teach, in place, on its device; with equal weights in all processes.
             options: rates.
             steps: in all: the learning rate falls along a cosine.
-            seed: of how pictures are varied.
+            seed: of how pictures are varied, in each process otherwise.
+            processes: that share every step's pictures.
         """
         self.network, self.options, self.steps, self.step = network, options, steps, 0
-        self.generator = torch.Generator().manual_seed(seed)
+        self.processes, self._seed = processes, seed
+        self.generator = torch.Generator().manual_seed(seed + _NEXT_PROCESS * processes.rank)
         self._optimizer = torch.optim.AdamW(
             network.parameters(), options.rate, weight_decay=options.weight_decay
         )
@@ -232,14 +242,20 @@ class TrackerTraining:
             held.setdefault(int(number), {})[key] = value
         groups = self._optimizer.state_dict()["param_groups"]
         self._optimizer.load_state_dict({"state": held, "param_groups": groups})
-        self.generator.set_state(state["generator"])
         self.step = int(state["step"])
+        if self.processes.is_first:
+            self.generator.set_state(state["generator"])
+        else:  # The state is the first one's.
+            self.generator.manual_seed(self._seed + _NEXT_PROCESS * self.processes.rank + self.step)
 
     def teach(self, batch: CropBatch) -> float:
-        """One step.
+        """One step, of all processes together.
+
+        Args:
+            batch: this process's part of the step's pictures.
 
         Returns:
-            The loss before it.
+            The loss before it, of this part.
         """
         self.network.train()
         device = next(self.network.parameters()).device
@@ -260,6 +276,8 @@ class TrackerTraining:
         )
         self._optimizer.zero_grad()
         loss.backward()
+        gradients = (weights.grad for weights in self.network.parameters())
+        self.processes.average(gradient for gradient in gradients if gradient is not None)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), _LONGEST_GRADIENT)
         self._optimizer.step()
         self._smooth.update_parameters(self.network)
