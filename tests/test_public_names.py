@@ -51,6 +51,7 @@ AT_LEAST = {
         "Capture Capture.frame Capture.split Frame CaptureWriter read_capture write_capture"
     ),
     "capture.soundness": "find_problems require_sound",
+    "capture.arrays": "capture_from_arrays camera_from_matrices",
     "capture.checks": "CaptureError",
     "capture.motion": (
         "Motion Motion.pose gesture middle_of_hand named_motion open_motion read_motion "
@@ -74,6 +75,7 @@ AT_LEAST = {
     "hand.sparse_skin": "SparseSkin SparseSkin.load SparseSkin.save",
     "geometry.meshes": "SurfacePoints SurfacePoints.positions",
     "evaluate.metrics": "psnr",
+    "evaluate.pose_fit": "fit_pose",
     "evaluate.run": "EvaluateOptions evaluate_run",
     "export.run": "ExportOptions export_avatar",
     "export.rigged": "skinned_mesh mirrored",

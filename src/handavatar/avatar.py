@@ -62,6 +62,7 @@ from handavatar.jobs.threads import mapped
 from handavatar.render.chart import charted
 from handavatar.render.rasterize import covered_pixels
 from handavatar.render.sampling import depths_along, intervals_through_boxes
+from handavatar.render.silhouette import soft_silhouette
 from handavatar.render.skylight import even_directions, sky_light
 from handavatar.render.volume import composite_sparse, visibility
 from handavatar.replay import Replay
@@ -581,6 +582,12 @@ class HandAvatar(nn.Module):
     ) -> RayValues:
         """Evaluates rays; with gradient where gradients are enabled.
 
+        Gradient flows from all values of the result to the parameters of the fields (occupancy,
+        albedo, illumination, texture) and to the personal shape, if ``state`` was prepared with
+        gradient. It also flows to pose and rays, but through the fields at fixed depths: where a
+        surface moves across samples it is next to nothing, and no pose can be fitted by it. Fit
+        poses by :meth:`silhouette`, or with :func:`handavatar.evaluate.pose_fit.fit_pose`.
+
         The fields are first evaluated without gradient; the samples that can be seen are then
         evaluated again with gradient, through the pairs alone that decide their occupancy. The
         maximum sends no gradient elsewhere, so the gradient is that of the full evaluation up to
@@ -625,6 +632,30 @@ class HandAvatar(nn.Module):
         total = composite_sparse(seen.weights, seen.rays, values, len(rays.origins))
         color, albedo, light, normal, depth, alpha = total.split([3, 3, 1, 3, 1, 1], dim=-1)
         return RayValues(color, albedo, light[:, 0], normal, depth[:, 0], alpha[:, 0])
+
+    def silhouette(
+        self, pose: HandPose, camera: Camera, softness: float = 1.0
+    ) -> Float[Tensor, "height width"]:
+        """How much of each pixel the hand covers, softly, with gradient to pose and shape.
+
+        Of the personal mesh before subdivision, closed at the wrist; the occupancy's own outline
+        lies within a millimetre of it. The gradient in the pose is that of the outline's motion.
+
+        Args:
+            pose: of the hand in the world; with gradient, where that is wanted.
+            camera: of the picture.
+            softness: pixels over which an outline fades.
+
+        Raises:
+            ArgumentError: if one of them is of another kind.
+
+        Source: paper Sec. 3.1, the silhouette rendering of the shape loss.
+        """
+        require_type("pose", pose, HandPose)
+        require_type("camera", camera, Camera)
+        posed = self.coarse_personal(pose).posed(pose)
+        faces = self.coarse_rig.sealed_faces
+        return soft_silhouette(posed.sealed_vertices, faces, camera.to(self.device), softness)
 
     def visible_samples(
         self,
