@@ -1,4 +1,4 @@
-"""Poses of an avatar in pictures: the silhouette's gradient is that of its motion; a pose is found."""
+"""Poses of an avatar in pictures: a silhouette's gradient is its motion's; a pose is found."""
 
 import jaxtyping
 import numpy as np

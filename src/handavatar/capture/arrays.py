@@ -51,9 +51,9 @@ def capture_from_arrays(
         rotations: frames 16 3, axis-angle, radians, of the bones of the rig against their parents
             (``hand.pose.BONE_NAMES``).
         translations: frames 3, metres, world.
-        camera_from_world: 4 4, or one for each frame: metres, OpenCV camera axes (x right, y down, z
-            forward). The camera's axes are the world's if it is left out.
-        splits: ``train``, ``val`` or ``test`` of each frame; every fifth one is ``test`` if left out.
+        camera_from_world: 4 4, or one for each frame: metres, OpenCV camera axes (x right, y down,
+            z forward). The camera's axes are the world's if it is left out.
+        splits: ``train``, ``val`` or ``test`` of each frame; if left out every fifth is ``test``.
         times: seconds of each frame; thirty frames a second if left out.
         known: frames height width; false where neither hand nor background can be told.
         shape_coefficients: of the rig; not known if left out.
@@ -66,7 +66,8 @@ def capture_from_arrays(
         overwrite: replace a capture that is already there.
 
     Raises:
-        ArgumentError: an array is of another kind, length or size, or out of its range; it is named.
+        ArgumentError: an array is of another kind, length or size, or out of its range; the error
+            names it.
         CaptureError: the folder holds something that may not be replaced.
         RigError: there is no such rig.
     """
@@ -107,7 +108,9 @@ def capture_from_arrays(
         for number in range(count):
             image = image_from_array(f"images[{number}]", images[number])
             height, width = image.shape[:2]
-            said = {} if known is None else {"known": _booleans(f"known[{number}]", known[number])}
+            is_known = torch.ones(height, width, dtype=torch.bool)
+            if known is not None:
+                is_known = _booleans(f"known[{number}]", known[number])
             writer.add(
                 Frame(
                     name=f"{number:06d}",
@@ -118,7 +121,7 @@ def capture_from_arrays(
                     confidence=confidence,
                     split=splits[number],
                     time=float(seconds[number]),
-                    **said,
+                    known=is_known,
                 )
             )
     return read_capture(Path(folder))

@@ -57,9 +57,10 @@ def fit_pose(
         camera: of the picture.
         start: a pose that is nearly right; a tracker's, or the last picture's.
         known: height width, booleans; false where neither hand nor background can be told.
-        pose_error: degrees by which joints of ``start`` may be off; it may be a centimetre off per ten.
+        pose_error: degrees by which joints of ``start`` may be off; per ten of them the hand may be
+            a centimetre off.
         uses_texture: whether the colours of the avatar, as it is rendered, have a say at last.
-        light: number of the recording in whose light the picture was taken, of an avatar of several.
+        light: of an avatar of several recordings, number of the one whose light the picture has.
 
     Raises:
         ArgumentError: an argument is of another kind, size or range; it is named. So is the mask if
@@ -72,19 +73,20 @@ def fit_pose(
     ):
         require_type(name, value, kind)
     require_range("pose_error", pose_error, 0.01, 180)
-    said = {} if known is None else {"known": coverage_from_array("known", known) > 127}
+    coverage = coverage_from_array("mask", mask)
+    is_known = torch.ones_like(coverage, dtype=torch.bool)
     frame = Frame(
         name="picture",
         image=image_from_array("image", image),
-        coverage=coverage_from_array("mask", mask),
+        coverage=coverage,
         camera=camera.to("cpu"),
         pose=start.to("cpu"),
         confidence=0.5,
         split="test",
         time=0.0,
         covariance=_covariance(pose_error),
+        known=is_known if known is None else coverage_from_array("known", known) > 127,
         clip=light,
-        **said,
     )
     options = RegisterOptions(pose_error=pose_error, learns_pose_error=False, texture_sigmas=())
     if not bool(frame.mask.any()):
