@@ -12,9 +12,14 @@ from PIL import Image
 
 from handavatar import demo
 from handavatar.avatar import HandAvatar
+from handavatar.capture.checks import CaptureError
 from handavatar.capture.default import default_capture
 from handavatar.capture.frames import Capture, read_capture
+from handavatar.capture.video import VideoOptions
 from handavatar.demo import DemoOptions, run_demo
+from handavatar.errors import ArgumentError
+from handavatar.jobs.progress import Progress
+from handavatar.jobs.signals import Interrupted
 from handavatar.train.loop import METHODS
 
 
@@ -36,6 +41,54 @@ def _shorter(folder: Path, out: Path, counts: dict[str, int]) -> Capture:
     ]
     (out / "transforms.json").write_text(json.dumps(header))
     return read_capture(out)
+
+
+def test_a_demonstration_is_of_one_thing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once a capture is made; after one that failed, other seconds of the video may be tried."""
+    made: list[VideoOptions] = []
+
+    def capture_video(options: VideoOptions, progress: Progress) -> Capture:
+        made.append(options)
+        if options.start == 0:
+            raise CaptureError("no hand in the first seconds", "show it")
+        shutil.copytree(default_capture().folder, options.out)
+        (options.out / "fit.json").write_text('{"summary": {}}')
+        return read_capture(options.out)
+
+    def train(*_: object) -> None:
+        raise Interrupted("amid the training")
+
+    monkeypatch.setattr(demo, "capture_video", capture_video)
+    monkeypatch.setattr(demo, "summary_lines", lambda _: ["hand: right"])
+    monkeypatch.setattr(demo, "train", train)
+    video, other = tmp_path / "a.mp4", tmp_path / "b.mp4"
+    video.write_bytes(b"film")
+    other.write_bytes(b"another film")
+    own = DemoOptions(tmp_path / "out", video=video, fps=5.0)
+    with pytest.raises(CaptureError, match="first seconds"):
+        run_demo(own)
+    later = replace(own, start=2.0)
+    for _ in range(2):
+        with pytest.raises(Interrupted):
+            run_demo(later)
+    assert [(one.start, one.fps, one.file) for one in made] == [(0, 5, video), (2, 5, video)]
+    for wrong, said in (
+        (own, "a.mp4 with other start"),
+        (replace(later, fps=10.0), "a.mp4 with other fps"),
+        (replace(later, video=other), "demonstration of a.mp4, expected one of b.mp4"),
+        (DemoOptions(own.out), "demonstration of a.mp4, expected one of the capture that ships"),
+    ):
+        with pytest.raises(ArgumentError, match=said):
+            run_demo(wrong)
+    with pytest.raises(Interrupted):
+        run_demo(DemoOptions(tmp_path / "plain"))
+    (tmp_path / "plain" / "run").mkdir()
+    with pytest.raises(ArgumentError, match="of the capture that ships, expected one of a"):
+        run_demo(replace(own, out=tmp_path / "plain"))
+    with pytest.raises(ArgumentError, match="`end`"):
+        replace(own, end=-1.0)
+    with pytest.raises(ArgumentError, match="`fps`: found 5"):
+        DemoOptions(fps=5.0)
 
 
 @pytest.mark.slow
@@ -65,7 +118,7 @@ def test_the_demonstration_leaves_everything_it_promises(
     HandAvatar.load(out / "avatar.safetensors")
 
     # Told again, it continues: nothing is left to train.
-    monkeypatch.setattr(demo, "edited_pictures", lambda _: np.zeros((4, 4, 3), np.uint8))
+    monkeypatch.setattr(demo, "edited_pictures", lambda *_: np.zeros((4, 4, 3), np.uint8))
     before = (out / "avatar.safetensors").read_bytes()
     # What somebody has put there meanwhile stays.
     notes = out / "notes.txt", out / "run" / "renders" / "novel_poses" / "rgb" / "notes.txt"

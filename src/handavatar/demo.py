@@ -1,21 +1,27 @@
-"""The embedded default: the whole road on the capture that ships, offline, on two cores."""
+"""The whole road in one command: of the capture that ships, offline, or of a user's own video."""
 
+import io
 import json
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from hashlib import file_digest
 from itertools import count
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from PIL import Image
 
 from handavatar.animate import PICTURES, RenderOptions, pass_pictures, render_motion
 from handavatar.avatar import HandAvatar, rendering_seconds
+from handavatar.capture.checks import load_json
 from handavatar.capture.default import default_capture
+from handavatar.capture.frames import CAPTURE, Capture, read_capture
+from handavatar.capture.video import VideoOptions, capture_video
+from handavatar.capture.video_report import summary_lines
 from handavatar.edit import Edit, bones_named
-from handavatar.errors import SEEDS, require_ranges
+from handavatar.errors import SEEDS, ArgumentError, argument, require_ranges
 from handavatar.evaluate.run import EvaluateOptions, evaluate_run
 from handavatar.jobs.files import (
     FolderInUse,
@@ -39,6 +45,8 @@ def _is_older_demo(folder: Path) -> bool:
 
 DEMONSTRATION = FolderKind("demonstration", is_older=_is_older_demo)
 """The folder that :func:`run_demo` writes into."""
+_SOURCE = "source.json"
+"""In it, once its capture is made: of which video, and how."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +55,12 @@ class DemoOptions:
 
     Attributes:
         out: folder for everything; a demonstration that was interrupted there is continued.
+        video: recording of one bare hand, as for `capture video`: all is done with that hand, in
+            its light. By default with the capture that ships.
+        fps: pictures taken per second of the video.
+        start: seconds of the video from which pictures are taken.
+        end: seconds until which they are; the end of the video by default.
+        hand: which of two hands that are seen together is taken.
         steps: training steps; by default those of method ``quick``.
         frames: frames of the video of unseen poses.
         size: pixels along a side of the video.
@@ -55,6 +69,11 @@ class DemoOptions:
     """
 
     out: Path = Path("demo")
+    video: Path | None = None
+    fps: float = 10.0
+    start: float = 0.0
+    end: float | None = None
+    hand: Literal["only", "left", "right", "larger"] = "only"
     steps: int | None = None
     frames: int = 24
     size: int = 128
@@ -64,34 +83,72 @@ class DemoOptions:
     def __post_init__(self) -> None:
         """Refuses numbers that are out of range."""
         require_ranges(self, steps=(1, 10**8), frames=(1, 10_000), size=(2, 4096), seed=SEEDS)
+        self.of_video(self.video or Path()).sampling()  # Refuses what selects nothing.
+        if self.video is None:
+            for name in ("fps", "start", "end", "hand"):
+                if getattr(self, name) != getattr(DemoOptions, name):
+                    words = f"{getattr(self, name)} without a video"
+                    raise ArgumentError(name, words, f"{argument('video')} beside it")
+
+    def of_video(self, video: Path) -> VideoOptions:
+        """How the capture is made of the user's video."""
+        return VideoOptions(
+            video,
+            self.out / "capture",
+            fps=self.fps,
+            start=self.start,
+            end=self.end,
+            hand=self.hand,
+        )
 
 
 def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
-    """Trains on the shipped capture, judges held-out poses, renders new ones, edits one.
+    """Trains on the shipped capture or on a video, judges held-out poses, renders, edits.
 
     Args:
         options: where to, how much.
         progress: told how far the whole demonstration is.
 
     Leaves ``avatar.safetensors``, ``metrics.json``, ``report.html``, ``overview.png``,
-    ``novel_poses.mp4``, ``edits.png`` and the run itself in ``options.out``.
+    ``novel_poses.mp4``, ``edits.png`` and the run itself in ``options.out``; of a video also
+    ``capture`` and ``own_motion.mp4``, the avatar beside the video's held-out frames.
 
     Returns:
         The folder.
 
     Raises:
         FolderInUse: if ``out`` holds something that is no demonstration.
+        ArgumentError: if it holds a demonstration of something else.
+        CaptureError: if no hand can be learned from the video; it says why.
     """
     out = options.out
     run = out / "run"
     claim_folder(out, DEMONSTRATION)
     begin = time.monotonic()
-    video = rendering_seconds(options.size, options.size) * options.frames
-    stages = progress.stages({"training": 400.0, "judging": 180.0, "a video": video, "edits": 8.0})
-    _say("1/4 training on the shipped capture", begin)
+    is_own = options.video is not None
+    source = _source(options)
+    stages = progress.stages(
+        {
+            "the hand in the video": 400.0 if is_own else 0.0,
+            "training": 700.0 if is_own else 400.0,
+            "judging": 400.0 if is_own else 180.0,
+            "a video": rendering_seconds(options.size, options.size) * options.frames,
+            "edits": 8.0,
+        }
+    )
+    if options.video is None:
+        capture = default_capture()
+    else:
+        _say(f"looking for the hand in {options.video.name}", begin)
+        capture = _captured(
+            options.of_video(options.video), source, stages["the hand in the video"]
+        )
+        for line in summary_lines(load_json(capture.folder / "fit.json")["summary"]):
+            _say(line, begin)
+    _say(f"1/4 training on {'your video' if is_own else 'the shipped capture'}", begin)
     train(
         TrainOptions(
-            capture=default_capture().folder,
+            capture=capture.folder,
             out=run,
             steps=options.steps,
             device=options.device,
@@ -104,6 +161,8 @@ def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
     metrics = evaluate_run(EvaluateOptions(run=run, device=options.device), stages["judging"])
     _copy(run / "evaluation" / "metrics.json", out / "metrics.json")
     _copy(run / "evaluation" / "report.html", out / "report.html")
+    if is_own:
+        _copy(run / "evaluation" / "own_motion.mp4", out / "own_motion.mp4")
     with write_aside(out / "overview.png") as aside:
         Image.fromarray(overview(run / "evaluation")).save(aside)
     _say("3/4 a video of poses it never saw", begin)
@@ -123,7 +182,7 @@ def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
     stages["edits"](0.0)
     _say("4/4 edits", begin)
     with write_aside(out / "edits.png") as aside:
-        edits = edited_pictures(HandAvatar.load(out / "avatar.safetensors"))
+        edits = edited_pictures(HandAvatar.load(out / "avatar.safetensors"), capture)
         Image.fromarray(edits).save(aside)
     _say(
         f"done: {metrics['paper']['psnr']:.1f} dB (paper's protocol), "
@@ -131,6 +190,64 @@ def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
         begin,
     )
     return out
+
+
+def _source(options: DemoOptions) -> dict[str, Any]:
+    """What a demonstration is of; nothing is said of the capture that ships.
+
+    Raises:
+        ArgumentError: if ``out`` holds a demonstration of something else.
+    """
+    now: dict[str, Any] = {}
+    if options.video is not None:
+        with options.video.open("rb") if options.video.is_file() else _nothing() as content:
+            digest = file_digest(content, "sha256").hexdigest()
+        now = {
+            "video": options.video.name,
+            "sha256": digest,
+            "fps": options.fps,
+            "start": options.start,
+            "end": options.end,
+            "hand": options.hand,
+        }
+    path = options.out / _SOURCE
+    if path.is_file():
+        before = load_json(path)
+    elif (options.out / "run").exists():
+        before = {}
+    else:
+        return now
+    if before != now:
+        found, wanted = (str(one.get("video", "the capture that ships")) for one in (before, now))
+        if found == wanted:
+            differ = [key for key in now if before.get(key) != now[key]]
+            found = f"{found} with other {', '.join(differ)}"
+        raise ArgumentError(
+            "out",
+            f"{options.out}, a demonstration of {found}",
+            f"one of {wanted}",
+            f"name another folder with {argument('out', options.out.with_name('other'))}",
+        )
+    return now
+
+
+def _nothing() -> io.BytesIO:
+    """In place of a folder's or a pattern's content: their names alone are compared."""
+    return io.BytesIO()
+
+
+def _captured(options: VideoOptions, source: dict[str, Any], progress: Progress) -> Capture:
+    """The capture of a video; that which an earlier, interrupted command has made."""
+    note = options.out.parent / _SOURCE
+    if note.is_file():
+        progress(1.0)
+        return read_capture(options.out)
+    # One without a note is of a command that was killed just before it would have left one.
+    marker = read_marker(options.out)
+    is_ours = marker is not None and marker["kind"] == CAPTURE.name
+    capture = capture_video(replace(options, overwrite=is_ours), progress=progress)
+    write_atomically({note: json.dumps(source, indent=1).encode()})
+    return capture
 
 
 def _copy(source: Path, target: Path) -> None:
@@ -157,12 +274,15 @@ def overview(evaluation: Path, count: int = 4) -> np.ndarray:
     return np.concatenate([strip[:, : strip.shape[1] * 5 // 6] for strip in pictures], axis=0)
 
 
-def edited_pictures(avatar: HandAvatar) -> np.ndarray:
+def edited_pictures(avatar: HandAvatar, capture: Capture) -> np.ndarray:
     """One held-out frame side by side: as it is, brighter, recoloured, without finger shadows.
+
+    Args:
+        avatar: of the capture.
+        capture: whose first held-out frame is taken.
 
     Source: paper supplement (texture editing).
     """
-    capture = default_capture()
     frame = capture.frame(capture.split("test")[0])
     edits = (
         Edit(),
@@ -172,7 +292,8 @@ def edited_pictures(avatar: HandAvatar) -> np.ndarray:
         Edit(lifted_bones=bones_named(("thumb", "index", "middle"))),
     )
     camera = frame.camera.resized(128, 128)
-    pictures = [pass_pictures(avatar.render(frame.pose, camera, edit))["rgb"] for edit in edits]
+    renderings = avatar.render_batch([frame.pose] * len(edits), [camera] * len(edits), edits)
+    pictures = [pass_pictures(rendering, capture.side)["rgb"] for rendering in renderings]
     return np.concatenate(pictures, axis=1)
 
 

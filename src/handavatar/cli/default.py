@@ -7,13 +7,17 @@ from handavatar.jobs.progress import Progress
 
 
 def demo(words: list[str], progress: Progress) -> int:
-    """The whole road on the capture that ships: train, evaluate, render, report."""
+    """The whole road on the capture that ships, or on your own --video: train, evaluate, render."""
     from handavatar.cli.arguments import parse
+    from handavatar.cli.inputs import VIDEO
     from handavatar.demo import DemoOptions, run_demo
 
-    options = parse(DemoOptions, words, "demo")
+    options = parse(DemoOptions, words, "demo", reads={"video": VIDEO})
     with progress:
         run_demo(options, progress)
+    if options.video is not None:
+        say(f"open {options.out / 'report.html'}, {options.out / 'own_motion.mp4'}")
+        say(f"next: handavatar view {options.out / 'run'}")
     return 0
 
 
