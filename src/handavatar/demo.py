@@ -136,16 +136,21 @@ def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
             "edits": 8.0,
         }
     )
+    numbers = count(1)
+
+    def say_step(text: str) -> None:
+        _say(f"{next(numbers)}/{5 if is_own else 4} {text}", begin)
+
     if options.video is None:
         capture = default_capture()
     else:
-        _say(f"looking for the hand in {options.video.name}", begin)
+        say_step(f"looking for the hand in {options.video.name}")
         capture = _captured(
             options.of_video(options.video), source, stages["the hand in the video"]
         )
         for line in summary_lines(load_json(capture.folder / "fit.json")["summary"]):
             _say(line, begin)
-    _say(f"1/4 training on {'your video' if is_own else 'the shipped capture'}", begin)
+    say_step(f"training on {'your video' if is_own else 'the shipped capture'}")
     train(
         TrainOptions(
             capture=capture.folder,
@@ -157,7 +162,7 @@ def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
         stages["training"],
     )
     _copy(run / "avatar.safetensors", out / "avatar.safetensors")
-    _say("2/4 judging held-out poses", begin)
+    say_step("judging held-out poses")
     metrics = evaluate_run(EvaluateOptions(run=run, device=options.device), stages["judging"])
     _copy(run / "evaluation" / "metrics.json", out / "metrics.json")
     _copy(run / "evaluation" / "report.html", out / "report.html")
@@ -165,7 +170,7 @@ def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
         _copy(run / "evaluation" / "own_motion.mp4", out / "own_motion.mp4")
     with write_aside(out / "overview.png") as aside:
         Image.fromarray(overview(run / "evaluation")).save(aside)
-    _say("3/4 a video of poses it never saw", begin)
+    say_step("a video of poses it never saw")
     renders = _folder_of_pictures(run / "renders")
     render_motion(
         RenderOptions(
@@ -180,7 +185,7 @@ def run_demo(options: DemoOptions, progress: Progress = SILENT) -> Path:
     )
     _copy(renders / "rgb.mp4", out / "novel_poses.mp4")
     stages["edits"](0.0)
-    _say("4/4 edits", begin)
+    say_step("edits")
     with write_aside(out / "edits.png") as aside:
         edits = edited_pictures(HandAvatar.load(out / "avatar.safetensors"), capture)
         Image.fromarray(edits).save(aside)
