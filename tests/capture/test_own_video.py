@@ -38,6 +38,7 @@ def test_a_video_becomes_everything_in_one_command(
         quick = replace(
             options,
             rig="open-hand-778",
+            size=64,
             fit=FitOptions(focal_share=FOCAL / max(WIDTH, HEIGHT), landmark_steps=30),
             register=RegisterOptions(coefficient_sigma=1.0, restarts=0, texture_sigmas=()),
         )
