@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from priorities import is_ordinary, make_ordinary
 from torch import Tensor
 
 from handavatar.avatar import HandAvatar
@@ -144,6 +145,15 @@ def write_tiny_capture(
     )
     write_capture(folder, frames, **(facts | header))
     return folder
+
+
+@pytest.fixture(autouse=True)
+def _no_priority() -> Iterator[None]:
+    """No test makes this process one that the others have to wait for."""
+    yield
+    stays_ordinary = is_ordinary()
+    make_ordinary()
+    assert stays_ordinary, "this test has made its process a real-time one"
 
 
 @pytest.fixture(scope="session")

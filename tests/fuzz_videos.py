@@ -11,6 +11,7 @@ from pathlib import Path
 import av
 import numpy as np
 from fuzzing import changed_bytes
+from priorities import ordinary_afterwards
 
 _SIZE = 96
 _NUM_PICTURES = 6
@@ -66,7 +67,7 @@ def save_film(folder: Path, film: Film) -> Path:
     """Writes a few small pictures, in which something moves."""
     path = folder / film.name
     os.environ.setdefault("SVT_LOG", "0")  # AV1's encoder is talkative.
-    with av.open(str(path), "w", options=dict(film.options)) as container:
+    with ordinary_afterwards(), av.open(str(path), "w", options=dict(film.options)) as container:
         container.metadata["title"] = "a hand \x1b[31m"
         stream = container.add_stream(film.codec, rate=25)
         stream.width = stream.height = _SIZE

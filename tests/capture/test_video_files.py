@@ -11,6 +11,7 @@ import av
 import numpy as np
 import pytest
 from PIL import Image
+from priorities import is_ordinary, ordinary_afterwards
 from videos import CASES, add_silence, needs_cases, save_sound
 
 from handavatar.capture.checks import CaptureError
@@ -212,7 +213,7 @@ def stored(kind: Kind, srgb: np.ndarray) -> av.VideoFrame:
 
 
 def write(path: Path, kind: Kind, pictures: list[np.ndarray], rate: int = 25) -> Path:
-    with av.open(str(path), "w") as container:
+    with ordinary_afterwards(), av.open(str(path), "w") as container:
         stream = container.add_stream(kind.codec, rate=rate)
         stream.height, stream.width = pictures[0].shape[:2]
         stream.pix_fmt = kind.pixels
@@ -240,6 +241,13 @@ def write(path: Path, kind: Kind, pictures: list[np.ndarray], rate: int = 25) ->
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
     return path
+
+
+def test_writing_av1_leaves_the_process_an_ordinary_one(tmp_path: Path) -> None:
+    """Without care it would keep the cores from all else, and so would what it starts."""
+    (kind,) = (kind for kind in KINDS if kind.name == "av1.mp4")
+    write(tmp_path / kind.name, kind, [painted()])
+    assert is_ordinary()
 
 
 @pytest.mark.slow
