@@ -43,6 +43,7 @@ def scenes() -> list[tuple[np.ndarray, np.ndarray]]:
     return found
 
 
+@pytest.mark.slow
 def test_hands_are_found_in_whole_pictures(scenes: list[tuple[np.ndarray, np.ndarray]]) -> None:
     apart = []
     for image, truth in scenes:

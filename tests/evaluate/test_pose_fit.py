@@ -94,6 +94,7 @@ def _drawn(avatar: HandAvatar, pose: HandPose, camera: Camera, *_: object) -> Re
     return Rendering(color, color, alpha, color, alpha, alpha)
 
 
+@pytest.mark.slow
 def test_a_pose_is_found_in_a_picture(
     small_avatar: HandAvatar, monkeypatch: pytest.MonkeyPatch
 ) -> None:

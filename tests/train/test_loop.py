@@ -187,6 +187,7 @@ def test_several_threads_give_the_same_bytes_every_time(tiny_capture: Path, tmp_
     assert not torch.are_deterministic_algorithms_enabled()
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(
     tiny_capture: Path, tmp_path: Path
 ) -> None:

@@ -80,6 +80,7 @@ def test_every_layer_is_fluid_and_in_full(studio: Studio, layer: str) -> None:
     assert psnr(small, half) > 19 and fluid.std() > 5
 
 
+@pytest.mark.slow
 def test_the_last_stage_is_what_render_gives_to_the_bit(
     studio: Studio, small_avatar: HandAvatar
 ) -> None:
