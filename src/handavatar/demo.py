@@ -1,6 +1,5 @@
 """The whole road in one command: of the capture that ships, offline, or of a user's own video."""
 
-import io
 import json
 import sys
 import time
@@ -205,8 +204,10 @@ def _source(options: DemoOptions) -> dict[str, Any]:
     """
     now: dict[str, Any] = {}
     if options.video is not None:
-        with options.video.open("rb") if options.video.is_file() else _nothing() as content:
-            digest = file_digest(content, "sha256").hexdigest()
+        digest = None  # Of a folder or a pattern the name alone is compared.
+        if options.video.is_file():
+            with options.video.open("rb") as content:
+                digest = file_digest(content, "sha256").hexdigest()
         now = {
             "video": options.video.name,
             "sha256": digest,
@@ -234,11 +235,6 @@ def _source(options: DemoOptions) -> dict[str, Any]:
             f"name another folder with {argument('out', options.out.with_name('other'))}",
         )
     return now
-
-
-def _nothing() -> io.BytesIO:
-    """In place of a folder's or a pattern's content: their names alone are compared."""
-    return io.BytesIO()
 
 
 def _captured(options: VideoOptions, source: dict[str, Any], progress: Progress) -> Capture:

@@ -82,11 +82,10 @@ def capture_from_arrays(
     if splits is None:
         splits = ["test" if number % 5 == 4 else "train" for number in range(count)]
     seconds = [number / 30 for number in range(count)] if times is None else list(times)
-    for name, values in (("masks", masks), ("splits", splits), ("times", seconds)):
-        if len(values) != count:
+    lists = {"masks": masks, "splits": splits, "times": seconds, "known": known}
+    for name, values in lists.items():
+        if values is not None and len(values) != count:
             raise ArgumentError(name, str(len(values)), f"as many as images, {count}")
-    if known is not None and len(known) != count:
-        raise ArgumentError("known", str(len(known)), f"as many as images, {count}")
     wanted = load_rig(rig)
     with CaptureWriter(
         Path(folder),

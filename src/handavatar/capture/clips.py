@@ -27,9 +27,8 @@ from handavatar.capture.guided_masks import (
     find_guided_mask,
     guided_by_given,
     learn_guided_colors,
-    pixels_per_metre_at,
+    pixels_before_wrist,
     placed_mesh,
-    wrist_in,
 )
 from handavatar.capture.masks import (
     HandMask,
@@ -472,7 +471,6 @@ def _known_before_wrist(clip: Clip, fitted: FittedHands, rig: Rig) -> list[Bool[
     found = []
     for hand, vertices in zip(clip.track.hands, fitted.vertices, strict=True):
         view = hand.window.camera(fitted.fit.focal)
-        margin = _WRIST_MARGIN * pixels_per_metre_at(view, vertices)
-        before = wrist_in(view, rig, vertices).before_pixels(view.width) > margin
+        before = pixels_before_wrist(view, rig, vertices, _WRIST_MARGIN)
         found.append(before & inside_picture(hand.window))
     return found

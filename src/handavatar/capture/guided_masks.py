@@ -37,7 +37,7 @@ from handavatar.capture.masks import (
 )
 from handavatar.capture.outlines import silhouette
 from handavatar.capture.tracking import TrackedHand
-from handavatar.geometry.cameras import Camera, project
+from handavatar.geometry.cameras import Camera, pixel_centers, project
 from handavatar.hand.rig import Rig
 
 # Metres. Farther from the mesh nothing is hand; so deep inside colours are learned as skin.
@@ -112,6 +112,21 @@ def wrist_in(camera: Camera, rig: Rig, vertices: Float[Tensor, "vertices 3"]) ->
     """
     places = project(camera, vertices)[0].double().numpy()
     return wrist_line(places[rig.rim.numpy()], places.mean(0))
+
+
+def pixels_before_wrist(
+    camera: Camera, rig: Rig, vertices: Float[Tensor, "vertices 3"], margin: float
+) -> Bool[np.ndarray, "height width"]:
+    """Pixels in front of the wrist: what lies behind it is the forearm's.
+
+    Args:
+        camera: the view, in its own axes.
+        rig: whose vertices they are.
+        vertices: metres, camera axes.
+        margin: metres before the rig's end from where on they count.
+    """
+    before = wrist_in(camera, rig, vertices).before(pixel_centers(camera).double().numpy())
+    return before > margin * pixels_per_metre_at(camera, vertices)
 
 
 def pixels_per_metre_at(camera: Camera, vertices: Float[Tensor, "vertices 3"]) -> float:

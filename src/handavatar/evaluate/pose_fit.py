@@ -11,13 +11,13 @@ from torch.nn.functional import pad
 from handavatar.avatar import HandAvatar
 from handavatar.capture.arrays import Array, coverage_from_array, image_from_array
 from handavatar.capture.frames import FITTED_SIDE, Frame
-from handavatar.capture.guided_masks import pixels_per_metre_at, wrist_in
+from handavatar.capture.guided_masks import pixels_before_wrist
 from handavatar.capture.registration import poses_of, register_frames
 from handavatar.capture.windows import resized
 from handavatar.errors import ArgumentError, require_range
 from handavatar.evaluate.registered import fitted_hand, registered_pose
 from handavatar.fit.register import RegisterOptions
-from handavatar.geometry.cameras import Camera, pixel_centers, project
+from handavatar.geometry.cameras import Camera, project
 from handavatar.geometry.rotations import apply_rigid
 from handavatar.geometry.tensors import require_type
 from handavatar.hand.pose import HandPose
@@ -132,9 +132,7 @@ def _before_wrist(hand: ShapedHand, frame: Frame) -> Bool[Tensor, "height width"
     """Pixels on the hand's side of where the avatar ends, in the pose to begin with."""
     vertices = apply_rigid(frame.camera.camera_from_world, hand.posed(frame.pose).vertices)
     camera = replace(frame.camera, camera_from_world=torch.eye(4))
-    margin = _WRIST_MARGIN * pixels_per_metre_at(camera, vertices)
-    before = wrist_in(camera, hand.rig, vertices).before(pixel_centers(camera).double().numpy())
-    return torch.from_numpy(before > margin)
+    return torch.from_numpy(pixels_before_wrist(camera, hand.rig, vertices, _WRIST_MARGIN))
 
 
 def _covariance(pose_error: float) -> Float[Tensor, "51 51"]:

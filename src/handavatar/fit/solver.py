@@ -24,7 +24,6 @@ from handavatar.fit.kinematics import NUM_UNKNOWNS, moved_pose, pose_difference
 from handavatar.fit.motion import MotionTerms, motion_terms, solve_chain
 from handavatar.fit.pictures import PictureBand
 from handavatar.hand.pose import HandPose
-from handavatar.jobs.memory import return_free_memory
 from handavatar.jobs.threads import mapped
 
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-5, 1e4
@@ -137,13 +136,7 @@ class Descent:
             band = self.band(frame, look.sigma)
             return see_texture(points.hand.rig, vertices, points.surface, picture, band)
 
-        found: list[SeenTexture] = []
-        for start in range(0, len(self.observations), _ADDED):
-            numbers = range(len(self.observations))[start : start + _ADDED]
-            found += mapped(seen, numbers, self.threads)
-            if len(self.observations) > _ADDED:
-                return_free_memory()
-        return found
+        return mapped(seen, range(len(self.observations)), self.threads, tidies=True)
 
     def energies(self, look: Look) -> Float[Tensor, "frames"]:
         """Of each frame, priors included."""
@@ -238,7 +231,7 @@ class Descent:
 
         for start in range(0, count, _ADDED):
             some = slice(start, min(start + _ADDED, count))
-            parts = mapped(linearised, range(count)[some], self.threads)
+            parts = mapped(linearised, range(count)[some], self.threads, tidies=True)
             hessians = torch.stack([part.hessian for part in parts])
             gradients = torch.stack([part.gradient for part in parts])
             blocks[some], mixed[some] = hessians[:, own, own], hessians[:, own, others]
@@ -246,8 +239,6 @@ class Descent:
             energies[some] = torch.tensor([part.energy for part in parts])
             curvature += hessians[:, others, others].sum(0)
             slope += gradients[:, others].sum(0)
-            if count > _ADDED:
-                return_free_memory()
         rig = self.points_of(self.shared, 0).hand.rig
         residuals, jacobian = habit_residuals(rig, poses.rotations)
         energies += residuals.square().sum(-1)

@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import torch
 
+from handavatar.jobs.memory import tidy
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.signals import heed, heeds, stop_point
 
@@ -37,6 +38,7 @@ def mapped(
     pieces: Iterable[Piece],
     count: int | None = None,
     progress: Progress = SILENT,
+    tidies: bool = False,
 ) -> list[Result]:
     """``function`` of every piece, in order, without gradient; each begins at a stop point.
 
@@ -45,6 +47,7 @@ def mapped(
         pieces: of the work.
         count: of threads; by default as many as torch has.
         progress: told how many pieces are done.
+        tidies: whether free memory is given back now and then, as :func:`tidy` does.
 
     Raises:
         Interrupted: if the command was told to stop.
@@ -64,15 +67,16 @@ def mapped(
     before = torch.get_num_threads()
     count = before if count is None else count
     results: list[Result] = []
+    kept = tidy if tidies else iter
     if count == 1 or len(work) == 1:
         with torch.no_grad():
-            for piece in work:
+            for piece in kept(work):
                 stop_point()
                 results.append(function(piece))
                 progress(len(results), len(work))
         return results
     try:
-        for result in _pool(count).map(without_gradient, range(len(work))):
+        for result in kept(_pool(count).map(without_gradient, range(len(work)))):
             results.append(result)
             progress(len(results), len(work))
         return results

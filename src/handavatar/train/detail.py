@@ -24,7 +24,6 @@ from handavatar.geometry.cameras import project
 from handavatar.geometry.meshes import face_cross_products
 from handavatar.geometry.rotations import invert_rigid
 from handavatar.jobs.finite import require_finite
-from handavatar.jobs.memory import return_free_memory
 from handavatar.jobs.progress import SILENT, Progress
 from handavatar.jobs.signals import unbroken
 from handavatar.jobs.stage_states import NOT_KEPT, StageState, WorkState, named_tensors
@@ -53,8 +52,6 @@ _LARGEST_GAP = 0.01
 _FINE = 5e-3
 """Metres on the skin by which what is unwrapped is blurred, to take away what is coarser."""
 _AT_ONCE = 32768
-_TIDIED_EVERY = 32
-"""Frames after which free memory is given back: what stays of each lies between what does not."""
 _FADE = 8
 """Passes of a mean over 5 x 5 texels by which what was seen runs out into what was not."""
 _LEVELS = (2, 4)
@@ -143,12 +140,10 @@ def find_detail_views(
     owners = seen.frames[seen.starts[:-1]]
 
     def view_of(number: int) -> DetailView:
-        if number % _TIDIED_EVERY == 0:
-            return_free_memory()
         mine = owners == number
         return _view_of(avatar, frames[number], albedo, seen.points[mine], light[mine])
 
-    return mapped(view_of, range(len(frames)), progress=progress)
+    return mapped(view_of, range(len(frames)), progress=progress, tidies=True)
 
 
 @torch.no_grad()
@@ -323,14 +318,12 @@ def unwrap_frames(
     texels = texels_of(chart, size)
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     uv_areas = (first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]).abs() / 2
-
-    def unwrap_view(number: int) -> UnwrapView:
-        if number % _TIDIED_EVERY == 0:
-            return_free_memory()
-        return _unwrap_view(avatar, frames[number], views[number])
-
-    pictures = mapped(unwrap_view, range(len(views)), progress=parts["unwrapping"])
-    return_free_memory()
+    pictures = mapped(
+        lambda number: _unwrap_view(avatar, frames[number], views[number]),
+        range(len(views)),
+        progress=parts["unwrapping"],
+        tidies=True,
+    )
     found = unwrap_pictures(pictures, rig.faces, texels, corners, parts["medians"])
     residual = texels.filled(found.residual * (found.seen / (found.seen + _SEEN))[:, None])
     residual = residual * believed_share(residual, pictures)
